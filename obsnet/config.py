@@ -1,0 +1,117 @@
+"""Frozen dataclasses as configuration: YAML in, checked objects out.
+
+Each stage owns one frozen dataclass of plain fields, validated in its `__post_init__`; this module only builds them from
+mappings, naming a wrong key with its nearest known neighbour.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from obsnet.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def build(cls: type[T], values: Mapping[str, Any] | None = None, where: str = "") -> T:
+    """Build a (nested) frozen dataclass from a mapping.
+
+    Parameters
+    ----------
+    cls : type
+        A dataclass whose fields are plain values or dataclasses themselves.
+    values : mapping, optional
+        Keys are field names; missing ones take their defaults.
+    where : str
+        Dotted path of `values` in the file, for messages.
+
+    Raises
+    ------
+    ConfigError
+        An unknown key (the nearest known one is named), a value of the wrong type, or one that the class refuses.
+    """
+    values = {} if values is None else values
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where or 'the configuration'} must be a mapping of keys, found {values!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    arguments = {}
+    for key, value in values.items():
+        path = f"{where}.{key}" if where else str(key)
+        if key not in fields:
+            near = difflib.get_close_matches(str(key), list(fields), n=1, cutoff=0.0)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise ConfigError(f"unknown key '{path}' in the configuration{hint} (known: {', '.join(fields)})")
+        arguments[key] = _convert(value, hints[key], path)
+    try:
+        return cls(**arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}" if where else str(error)) from None
+    except TypeError as error:
+        raise ConfigError(f"{where or cls.__name__}: {error}") from None
+
+
+def read_yaml(path: str | Path, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read a YAML file (interpolations resolved) and `key.sub=value` overrides into plain containers."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    try:
+        loaded = OmegaConf.load(path)
+        merged = OmegaConf.merge(loaded, OmegaConf.from_dotlist(list(overrides)))
+        plain = OmegaConf.to_container(merged, resolve=True)
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (OmegaConfBaseException, YAMLError, UnicodeDecodeError, ValueError) as error:
+        line = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not a valid YAML configuration: {line}") from None
+    if not isinstance(plain, dict):
+        raise ConfigError(f"{path} must hold a mapping of keys, found a {type(plain).__name__}")
+    return {str(key): value for key, value in plain.items()}
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Plain nested dictionary of a configuration dataclass, ready for YAML or JSON."""
+    return dataclasses.asdict(config)
+
+
+def _convert(value: Any, hint: Any, path: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        options = typing.get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        (hint,) = [option for option in options if option is not type(None)][:1]
+        return _convert(value, hint, path)
+    if origin is typing.Literal:
+        choices = typing.get_args(hint)
+        if value not in choices:
+            raise ConfigError(f"{path} must be one of {', '.join(map(str, choices))}, found {value!r}")
+        return value
+    if origin is tuple:
+        if isinstance(value, str) or not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{path} must be a list, found {value!r}")
+        item = typing.get_args(hint)[0]
+        return tuple(_convert(element, item, f"{path}[{i}]") for i, element in enumerate(value))
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value, path)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint in (str, Path) and isinstance(value, (str, Path)):
+        return hint(value)
+    if hint in (int, float, bool) and type(value) is not hint:
+        raise ConfigError(f"{path} must be {_article(hint)}, found {value!r}")
+    if hint is str:
+        raise ConfigError(f"{path} must be text, found {value!r}")
+    return value
+
+
+def _article(hint: type) -> str:
+    return {int: "a whole number", float: "a number", bool: "true or false"}[hint]

@@ -1,0 +1,79 @@
+"""A straight course at constant speed past a station, and what the station's observables are along it.
+
+Convention: x east, y north; azimuth from the station to the ship and course of the ship, degrees clockwise from north;
+range horizontal in metres; range rate positive when opening.
+
+The range at the closest point of approach (CPA) is signed: where it is positive the ship is at azimuth ``course + 90°`` at CPA
+(the station lies to its port), where it is negative at ``course - 90°`` (the station lies to its starboard).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class StraightCourse:
+    """Motion of one ship: CPA time [s since 1970], signed CPA range [m], course [deg], speed [m/s]."""
+
+    cpa_time: float
+    cpa_range_m: float
+    course_deg: float
+    speed_mps: float
+
+    @property
+    def cpa_azimuth_deg(self) -> float:
+        """Azimuth of the ship at CPA, [0, 360)."""
+        side = 90.0 if self.cpa_range_m >= 0 else -90.0
+        return (self.course_deg + side) % 360.0
+
+    def position(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """East and north [m] of the ship relative to the station at `time` [s since 1970]."""
+        course = np.deg2rad(self.course_deg)
+        along = self.speed_mps * (np.asarray(time, float) - self.cpa_time)
+        east = self.cpa_range_m * np.cos(course) + along * np.sin(course)
+        north = -self.cpa_range_m * np.sin(course) + along * np.cos(course)
+        return east, north
+
+    def observables(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Azimuth [deg], range [m] and range rate [m/s] of the ship where it is at `time`."""
+        along = self.speed_mps * (np.asarray(time, float) - self.cpa_time)
+        distance = np.hypot(self.cpa_range_m, along)
+        rate = self.speed_mps * along / np.maximum(distance, 1e-9)
+        azimuth = self.course_deg + np.rad2deg(np.arctan2(self.cpa_range_m, along))
+        return azimuth % 360.0, distance, rate
+
+
+def fit_straight_course(time: np.ndarray, east: np.ndarray, north: np.ndarray) -> StraightCourse:
+    """Least-squares straight course through positions (paper's Table I truth: a line fitted to the AIS positions).
+
+    Parameters
+    ----------
+    time : array, s since 1970; two distinct times at least.
+    east, north : arrays, m from the station.
+    """
+    time = np.asarray(time, float)
+    origin = time.mean()
+    design = np.stack([np.ones_like(time), time - origin], axis=1)
+    (x0, vx), (y0, vy) = (np.linalg.lstsq(design, np.asarray(values, float), rcond=None)[0] for values in (east, north))
+    speed = float(np.hypot(vx, vy))
+    cpa_time = float(origin - (x0 * vx + y0 * vy) / max(speed**2, 1e-12))
+    signed = float((x0 * vy - y0 * vx) / max(speed, 1e-12))
+    course = float(np.rad2deg(np.arctan2(vx, vy)) % 360.0)
+    return StraightCourse(cpa_time, signed, course, speed)
+
+
+def wrap180(angle_deg: np.ndarray | float) -> np.ndarray:
+    """Angle difference in [-180, 180).
+
+    >>> float(wrap180(350.0))
+    -10.0
+    """
+    return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
+
+
+def heard_time(emitted: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
+    """Time at which the station hears what left the ship at `emitted`, `delay_s` the path's travel time there."""
+    return np.asarray(emitted) + np.asarray(delay_s)
