@@ -1,0 +1,1 @@
+"""Compact hydrophone arrays: a different sensor that also ends in an azimuth map."""

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+
+from obsnet.errors import ConfigError, FilterError
+from obsnet.experiments import montecarlo
+
+
+def draw(rng, scale=1.0):
+    return scale * rng.normal(size=3)
+
+
+def die(rng):
+    raise FilterError("all weights are zero")
+
+
+def test_outcomes_do_not_depend_on_the_number_of_processes():
+    alone = montecarlo.run(draw, runs=4, seed=3, jobs=1, arguments=(2.0,))
+    together = montecarlo.run(draw, runs=4, seed=3, jobs=2, arguments=(2.0,))
+    np.testing.assert_array_equal(alone, together)
+
+
+def test_the_first_runs_do_not_depend_on_how_many_follow_and_seeds_differ():
+    few, many = (montecarlo.run(draw, runs=n, seed=5) for n in (2, 6))
+    np.testing.assert_array_equal(few, many[:2])
+    assert len({outcome[0] for outcome in many}) == 6
+    assert not np.array_equal(few, montecarlo.run(draw, runs=2, seed=6))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_progress_counts_every_run_once(jobs):
+    seen = []
+    montecarlo.run(draw, runs=3, seed=0, jobs=jobs, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_failing_trial_fails_the_study(jobs):
+    with pytest.raises(FilterError, match="all weights are zero"):
+        montecarlo.run(die, runs=3, seed=0, jobs=jobs)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"runs": 0, "seed": 0}, "number of runs"),
+        ({"runs": 2.5, "seed": 0}, "number of runs"),
+        ({"runs": 1, "seed": -1}, "seed"),
+        ({"runs": 1, "seed": 0, "jobs": 0}, "job"),
+    ],
+)
+def test_bad_requests_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        montecarlo.run(draw, **settings)
