@@ -16,9 +16,9 @@ def dbscan(points: np.ndarray, radius: float, min_points: int = 1) -> np.ndarray
     """Cluster label of each point; `NOISE` (−1) where it belongs to none.
 
     A core point has at least `min_points` points, itself included, within `radius` (inclusive). Clusters are
-    the connected components of the core points; another point within `radius` of a core point joins the cluster
-    found first (the one with the lowest label); the rest is noise. Labels count from 0 in the order in which
-    clusters first appear among core points.
+    the connected components of the core points; another point within `radius` of a core point joins the
+    cluster found first (the one with the lowest label); the rest is noise. Labels count from 0 in the order
+    in which clusters first appear among core points.
 
     Parameters
     ----------
