@@ -57,16 +57,14 @@ def build(cls: type[T], values: Mapping[str, Any] | None = None, where: str = ""
         raise ConfigError(f"{where or cls.__name__}: {error}") from None
 
 
-def read_yaml(path: str | Path, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Read a YAML file (interpolations resolved) and `key.sub=value` overrides into plain containers."""
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Read a YAML file, interpolations resolved, into plain containers."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
     try:
-        loaded = OmegaConf.load(path)
-        merged = OmegaConf.merge(loaded, OmegaConf.from_dotlist(list(overrides)))
-        plain = OmegaConf.to_container(merged, resolve=True)
+        plain = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
     except (OmegaConfBaseException, YAMLError, UnicodeDecodeError, ValueError) as error:
@@ -74,6 +72,22 @@ def read_yaml(path: str | Path, overrides: tuple[str, ...] = ()) -> dict[str, An
         raise ConfigError(f"{path} is not a valid YAML configuration: {line}") from None
     if not isinstance(plain, dict):
         raise ConfigError(f"{path} must hold a mapping of keys, found a {type(plain).__name__}")
+    return {str(key): value for key, value in plain.items()}
+
+
+def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str, Any]:
+    """Values with `section.key=value` overrides laid over them."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    for override in overrides:
+        if "=" not in override:
+            raise ConfigError(f"override '{override}' must read section.key=value")
+    try:
+        merged = OmegaConf.merge(OmegaConf.create(dict(values)), OmegaConf.from_dotlist(overrides))
+        plain = OmegaConf.to_container(merged, resolve=True)
+    except (OmegaConfBaseException, ValueError) as error:
+        raise ConfigError(f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}") from None
     return {str(key): value for key, value in plain.items()}
 
 

@@ -1,0 +1,441 @@
+"""The command line: ``obsnet demo``, ``track``, ``detect``, ``evaluate`` and their siblings.
+
+Each command imports what it needs when it runs. Bad input ends in one line on standard error and exit status 2.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from obsnet.errors import ConfigError, ObsnetError
+
+if TYPE_CHECKING:
+    from obsnet.calibration import Calibration
+    from obsnet.pipeline import RunConfig
+    from obsnet.run import Run
+    from obsnet.signals.station import Station
+
+app = typer.Typer(
+    name="obsnet",
+    help="Detect, localise and track ships from a single ocean-bottom station.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Waveforms = Annotated[list[str], typer.Argument(help="Waveform files, folders or an SDS archive, any format obspy reads.")]
+StationFile = Annotated[Path, typer.Option("--station", help="StationXML of the station.")]
+Code = Annotated[str | None, typer.Option("--code", help="NET.STA, where the StationXML holds several stations.")]
+Out = Annotated[Path, typer.Option("--out", help="Output folder.")]
+DetectorName = Annotated[str | None, typer.Option("--detector", help="learned or analytic.")]
+TrackerName = Annotated[str | None, typer.Option("--tracker", help="grid, bernoulli or focalization.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of parameters.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="One parameter, as section.key=value; repeatable.")]
+Start = Annotated[str | None, typer.Option("--start", help="ISO 8601 UTC start.")]
+End = Annotated[str | None, typer.Option("--end", help="ISO 8601 UTC end.")]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Threads or processes (all cores by default).")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
+AisFile = Annotated[Path | None, typer.Option("--ais", help="AIS file, overlaid on the report.")]
+CalibrationFile = Annotated[Path | None, typer.Option("--calibration", help="File of `obsnet calibrate`.")]
+Orientation = Annotated[float | None, typer.Option("--orientation", help="Azimuth of the first horizontal [deg].")]
+Polarity = Annotated[int | None, typer.Option("--hydrophone-polarity", help="1, or -1 for a reversed hydrophone.")]
+Depth = Annotated[float | None, typer.Option("--depth", help="Depth of the station [m], over the StationXML's.")]
+Latitude = Annotated[float | None, typer.Option("--latitude", help="Latitude [deg], over the StationXML's.")]
+Longitude = Annotated[float | None, typer.Option("--longitude", help="Longitude [deg], over the StationXML's.")]
+PropagationFile = Annotated[Path | None, typer.Option("--propagation", help="netCDF table of delays, over the configured ocean.")]
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Entry point: run a command, turn expected errors into one line and exit status 2."""
+    command = typer.main.get_command(app)
+    try:
+        code = command.main(args=arguments, prog_name="obsnet", standalone_mode=False)
+    except ObsnetError as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(0)
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        message = error.format_message()
+        if not message:
+            sys.exit(2)
+        _fail(message)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str) -> NoReturn:
+    print("obsnet: error: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(2)
+
+
+@app.command()
+def demo(out: Out = Path("demo-output"), detector: DetectorName = None, jobs: Jobs = None, quiet: Quiet = False) -> None:
+    """Run the main job on the bundled passage (simulated waveforms) and compare with its AIS."""
+    from obsnet.sample import sample_folder
+
+    folder = sample_folder()
+    _track([str(folder / "waveforms.mseed")], folder / "station.xml", out, detector=detector, jobs=jobs, quiet=quiet,
+           ais=folder / "ais.csv")  # fmt: skip
+    _evaluate(out, folder / "ais.csv", quiet=quiet)
+
+
+@app.command()
+def track(
+    waveforms: Waveforms,
+    station: StationFile,
+    out: Out,
+    code: Code = None,
+    detector: DetectorName = None,
+    tracker: TrackerName = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    start: Start = None,
+    end: End = None,
+    ais: AisFile = None,
+    calibration: CalibrationFile = None,
+    propagation: PropagationFile = None,
+    orientation: Orientation = None,
+    hydrophone_polarity: Polarity = None,
+    depth: Depth = None,
+    latitude: Latitude = None,
+    longitude: Longitude = None,
+    jobs: Jobs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Waveforms to maps, detections, tracks and a report."""
+    _track(
+        waveforms, station, out, code=code, detector=detector, tracker=tracker, config=config, overrides=overrides,
+        start=start, end=end, ais=ais, calibration=calibration, propagation=propagation, orientation=orientation,
+        hydrophone_polarity=hydrophone_polarity, depth=depth, latitude=latitude, longitude=longitude, jobs=jobs, quiet=quiet,
+    )  # fmt: skip
+
+
+@app.command()
+def detect(
+    waveforms: Waveforms,
+    station: StationFile,
+    out: Out,
+    code: Code = None,
+    detector: DetectorName = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    start: Start = None,
+    end: End = None,
+    ais: AisFile = None,
+    calibration: CalibrationFile = None,
+    propagation: PropagationFile = None,
+    orientation: Orientation = None,
+    hydrophone_polarity: Polarity = None,
+    depth: Depth = None,
+    latitude: Latitude = None,
+    longitude: Longitude = None,
+    jobs: Jobs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Waveforms to maps and detections, without tracking."""
+    _track(
+        waveforms, station, out, code=code, detector=detector, config=config, overrides=overrides, start=start, end=end,
+        ais=ais, calibration=calibration, propagation=propagation, orientation=orientation,
+        hydrophone_polarity=hydrophone_polarity, depth=depth, latitude=latitude, longitude=longitude, jobs=jobs, quiet=quiet,
+        tracking=False,
+    )  # fmt: skip
+
+
+@app.command()
+def evaluate(
+    folder: Annotated[Path, typer.Argument(help="Folder of `obsnet track`.")],
+    ais: Annotated[Path, typer.Option("--ais", help="AIS file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Print the core paper's Table I for a run, against AIS."""
+    _evaluate(folder, ais, as_json=as_json)
+
+
+def _track(
+    waveforms: list[str],
+    station_file: Path,
+    out: Path,
+    *,
+    code: str | None = None,
+    detector: str | None = None,
+    tracker: str | None = None,
+    config: Path | None = None,
+    overrides: list[str] | None = None,
+    start: str | None = None,
+    end: str | None = None,
+    ais: Path | None = None,
+    calibration: Path | None = None,
+    propagation: Path | None = None,
+    orientation: float | None = None,
+    hydrophone_polarity: int | None = None,
+    depth: float | None = None,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    jobs: int | None = None,
+    quiet: bool = False,
+    tracking: bool = True,
+) -> Run:
+    import obsnet.run as runs
+
+    settings = _run_config(config, overrides, detector, tracker)
+    station = _station(
+        station_file, code, start, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
+        latitude=latitude, longitude=longitude,
+    )  # fmt: skip
+    fitted = _calibration(calibration)
+    station = fitted.apply(station) if fitted else station
+    reference = _reference(ais, station) if ais else None
+    table = _table(propagation)
+    runs.prepare_folder(out)
+    with _progress("reading and detecting", quiet) as progress:
+        task = runs.track if tracking else runs.detect
+        run = task(
+            waveforms, station, settings, starttime=start, endtime=end, folder=out, threads=jobs, progress=progress,
+            amplitudes=fitted.amplitudes if fitted else None, table=table,
+        )  # fmt: skip
+    runs.write_tables(run, out)
+    run.plot(out / "report.png", reference=reference)
+    if not quiet:
+        _summary(run, out)
+    return run
+
+
+def _evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
+    from obsnet.evaluation import evaluate_folder
+
+    evaluation = evaluate_folder(folder, ais)
+    if as_json:
+        print(json.dumps(evaluation.to_json()))
+    elif not quiet:
+        print(evaluation.table())
+
+
+def _run_config(path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None) -> RunConfig:
+    from obsnet.config import build, merge_overrides, read_yaml
+    from obsnet.pipeline import RunConfig
+
+    values = read_yaml(path) if path else {}
+    values = merge_overrides(values, overrides or [])
+    for key, value in (("detector", detector), ("tracker", tracker)):
+        if value is not None:
+            values[key] = value
+    return build(RunConfig, values)
+
+
+def _station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:
+    from obsnet.signals.station import Station
+
+    return Station.from_stationxml(path, code, time=start, **{key: value for key, value in overrides.items() if value is not None})
+
+
+def _calibration(path: Path | None) -> Calibration | None:
+    if path is None:
+        return None
+    from obsnet.calibration import Calibration
+
+    return Calibration.read(path)
+
+
+def _table(path: Path | None) -> Any:
+    if path is None:
+        return None
+    from obsnet.ocean.rays import read_propagation
+
+    return read_propagation(path)
+
+
+def _reference(path: Path, station: Station) -> list:
+    from obsnet.ais import read, reference_tracks
+
+    return reference_tracks(read(path), station)
+
+
+def _summary(run: Run, out: Path) -> None:
+    found = run.detections
+    azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
+    print(f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range")
+    for note in run.info.get("notes", []):
+        print(f"note: {note}")
+    for warning in run.info["waveforms"].get("warnings", []):
+        print(f"note: {warning}")
+    for number, track in enumerate(run.tracks, 1):
+        row = track.row(number)
+        print(
+            f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at {row['cpa_distance_m'] / 1000:.2f} ± "
+            f"{row['cpa_distance_std_m'] / 1000:.2f} km, azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± "
+            f"{row['course_std_deg']:.1f}°, {row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
+            f"log Bayes factor {row['log_bayes_factor']:.0f} ({track.method})"
+        )
+    if not run.tracks:
+        print("no ship found" if "track" in run.info["seconds"] else "detections only")
+    print(f"written to {out}")
+
+
+@contextmanager
+def _progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None] | None]:
+    """A bar on a terminal, a plain line a tenth elsewhere, nothing when quiet."""
+    if quiet:
+        yield None
+        return
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task(text, total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+        return
+    shown = -1
+
+    def plain(done: float, total: float) -> None:
+        nonlocal shown
+        tenth = int(10 * done / total) if total else 10
+        if tenth > shown:
+            shown = tenth
+            print(f"{text}: {10 * tenth} %", file=sys.stderr, flush=True)
+
+    yield plain
+
+
+@app.command()
+def calibrate(
+    waveforms: Waveforms,
+    station: StationFile,
+    ais: Annotated[Path, typer.Option("--ais", help="AIS file of the passages to calibrate with.")],
+    out: Out,
+    code: Code = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    start: Start = None,
+    end: End = None,
+    depth: Depth = None,
+    quiet: Quiet = False,
+) -> None:
+    """Orientation, hydrophone polarity, position and amplitudes from AIS passages."""
+    from obsnet.calibration import calibrate_waveforms
+
+    settings = _run_config(config, overrides, None, None)
+    where = _station(station, code, start, depth_m=depth)
+    import obsnet.run as runs
+
+    folder = runs.prepare_folder(out)
+    with _progress("calibrating", quiet) as progress:
+        result = calibrate_waveforms(waveforms, where, _reference(ais, where), settings, start, end, progress)
+    result.write(folder / "calibration.yaml")
+    if not quiet:
+        print(result.table())
+        print(f"written to {folder / 'calibration.yaml'}; use it with: obsnet track … --calibration {folder / 'calibration.yaml'}")
+
+
+@app.command()
+def simulate(
+    out: Out,
+    hours: Annotated[float, typer.Option("--hours", min=0.1, help="Length of the record.")] = 8.0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of everything that is drawn.")] = 0,
+    ships: Annotated[int, typer.Option("--ships", min=0, help="Ships drawn at random.")] = 1,
+    ais: AisFile = None,
+    station: Annotated[Path | None, typer.Option("--station", help="StationXML whose position and depth to use.")] = None,
+    start: Start = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a record (miniSEED, StationXML, AIS, truth) with the twin."""
+    from obsnet.twin.station import simulate_folder
+
+    with _progress("simulating", quiet) as progress:
+        summary = simulate_folder(out, hours=hours, seed=seed, ships=ships, ais=ais, station=station, start=start, progress=progress)
+    if not quiet:
+        print(summary)
+
+
+@app.command()
+def fetch(
+    target: Annotated[str, typer.Argument(metavar="NET.STA", help="Station to fetch.")],
+    start: Annotated[str, typer.Option("--start", help="ISO 8601 UTC start.")],
+    end: Annotated[str, typer.Option("--end", help="ISO 8601 UTC end.")],
+    out: Out,
+    base_url: Annotated[str | None, typer.Option("--base-url", help="FDSN data centre, by name or address.")] = None,
+    channels: Annotated[str | None, typer.Option("--channels", help="Channel codes, comma separated, wildcards allowed.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Fetch waveforms and metadata from an FDSN data centre into an SDS archive; resumes where it stopped."""
+    from obsnet.fdsn import fetch as fetch_archive
+
+    options: dict[str, Any] = {}
+    if base_url:
+        options["base_url"] = base_url
+    if channels:
+        options["channels"] = tuple(part.strip() for part in channels.split(","))
+    with _progress("fetching", quiet) as progress:
+        report = fetch_archive(target, start, end, out, progress=progress, **options)
+    if not quiet:
+        print(report)
+
+
+EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
+
+
+@app.command()
+def reproduce(
+    name: Annotated[str, typer.Argument(help=", ".join(EXPERIMENTS))],
+    runs: Annotated[int | None, typer.Option("--runs", min=1, help="Monte Carlo runs.")] = None,
+    seed: Annotated[int, typer.Option("--seed")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the figure.")] = None,
+    jobs: Jobs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Repeat a paper's experiment; prints its numbers beside obsnet's."""
+    import importlib
+    import os
+
+    if name not in EXPERIMENTS:
+        raise ConfigError(f"no experiment '{name}'; choose one of {', '.join(EXPERIMENTS)}")
+    experiment = importlib.import_module(f"obsnet.experiments.{name}")
+    options: dict[str, Any] = {"seed": seed, "jobs": jobs or os.cpu_count() or 1}
+    if runs is not None:
+        options["runs"] = runs
+    with _progress(name, quiet or as_json) as progress:
+        result = experiment.reproduce(progress=progress, **options)
+    if out is not None:
+        from obsnet.run import prepare_folder
+
+        result.plot(prepare_folder(out) / f"{name}.png")
+    if as_json:
+        print(json.dumps(result.to_json()))
+    elif not quiet:
+        table = result.table()
+        print(table if isinstance(table, str) else "\n".join(map(str, table)))
+
+
+@app.command()
+def plot(
+    folder: Annotated[Path, typer.Argument(help="Folder of `obsnet track`.")],
+    figure: Annotated[int | None, typer.Option("--figure", help="The core paper's figure 3, 5, 6, 7 or 8 (all by default).")] = None,
+    ais: AisFile = None,
+) -> None:
+    """Draw the core paper's figures from any run."""
+    from obsnet.plots import FIGURES, draw
+
+    if figure is not None and figure not in FIGURES:
+        raise ConfigError(f"no figure {figure}; choose one of {', '.join(map(str, FIGURES))}")
+    for path in draw(folder, [figure] if figure else list(FIGURES), ais):
+        print(path)
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    import obsnet
+
+    print(obsnet.__version__)

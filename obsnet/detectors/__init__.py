@@ -1,0 +1,1 @@
+"""Representations in, likelihood maps out: analytic and learned detectors behind one protocol."""

@@ -1,0 +1,70 @@
+"""The direction that background noise comes from, per frequency, learned from the past of the azigram alone.
+
+Noise from one side (surf, a distant shipping lane, a storm) pulls weak cells towards itself. Told what that pull is, the
+azimuth detector asks whether a cell points to a ship rather than whether it points anywhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import uniform_filter1d
+
+from obsnet.layout import to_posix
+
+
+class BackgroundDirection:
+    """Mean phasor of each frequency over a window before now, renewed at UTC multiples of a step.
+
+    Parameters
+    ----------
+    window_s, step_s : s. The output for a frame depends on whole steps before the frame's own alone, so that any split of a
+        record gives the same; it is 0 (no direction known) until one step has been heard.
+    bandwidth_hz : the mean is taken over this band too, because noise is broad and a ship's tones are narrow.
+    """
+
+    def __init__(self, window_s: float, step_s: float, bandwidth_hz: float = 2.0) -> None:
+        self.window_s, self.step_s, self.bandwidth_hz = window_s, step_s, bandwidth_hz
+        self._sums: dict[int, np.ndarray] = {}
+        self._counts: dict[int, int] = {}
+
+    def __call__(self, azigram: xr.DataArray) -> np.ndarray:
+        """Background phasor (frequency, time) for the next block of an azigram; blocks must come in time order."""
+        steps = np.floor(to_posix(azigram["time"].values) / self.step_s).astype(np.int64)
+        values = azigram.values
+        background = np.zeros(values.shape, np.complex64)
+        edges = np.flatnonzero(np.diff(steps, prepend=steps[:1] - 1))
+        smooth_bins = self._smooth_bins(azigram["frequency"].values)
+        for lo, hi in zip(edges, [*edges[1:], len(steps)], strict=True):
+            step = int(steps[lo])
+            background[:, lo:hi] = self._mean_before(step, values.shape[0], smooth_bins)[:, None]
+            self._remember(step, values[:, lo:hi])
+        return background
+
+    def _smooth_bins(self, frequency: np.ndarray) -> int:
+        if len(frequency) < 2:
+            return 1
+        return max(1, min(len(frequency), round(self.bandwidth_hz / (frequency[1] - frequency[0]))))
+
+    def _mean_before(self, step: int, n_frequency: int, smooth_bins: int) -> np.ndarray:
+        oldest = step - round(self.window_s / self.step_s)
+        for key in [key for key in self._sums if key < oldest]:
+            del self._sums[key], self._counts[key]
+        total = np.zeros(n_frequency, complex)
+        count = 0
+        for key in sorted(self._sums):
+            if key < step:
+                total += self._sums[key]
+                count += self._counts[key]
+        if count == 0:
+            return total
+        mean = total / count
+        return uniform_filter1d(mean.real, smooth_bins, mode="nearest") + 1j * uniform_filter1d(
+            mean.imag, smooth_bins, mode="nearest"
+        )
+
+    def _remember(self, step: int, values: np.ndarray) -> None:
+        valid = ~np.isnan(values).all(axis=0)
+        if valid.any():
+            self._sums[step] = self._sums.get(step, 0) + np.nansum(values[:, valid], axis=1, dtype=complex)
+            self._counts[step] = self._counts.get(step, 0) + int(valid.sum())

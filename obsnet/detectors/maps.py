@@ -1,0 +1,138 @@
+"""Likelihood maps: what a detector says, minute by minute, about a ship at each azimuth, range and range rate.
+
+A `LikelihoodMaps` is an `xr.Dataset` of natural-log likelihood ratios ("a ship here" against "no ship", float32):
+
+- ``azimuth_llr`` (time, azimuth [deg]) and ``azimuth_coverage`` (time),
+- ``range_llr`` (time, range [m], range_rate [m/s]) and ``range_coverage`` (time).
+
+Either pair may be absent. Cells of minutes without data are NaN, their coverage is 0.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from obsnet.errors import LayoutError
+
+LikelihoodMaps: TypeAlias = xr.Dataset
+
+
+class Detector(Protocol):
+    """Anything that turns a stretch of representations into likelihood maps."""
+
+    window_s: float
+    name: str
+
+    def maps(self, representation: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
+        """Log-likelihood ratios and coverage at `minutes` (s since 1970) from an azigram or a cepstrogram."""
+        ...
+
+
+def window_bounds(frame_time: np.ndarray, minutes: np.ndarray, window_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and one-past-last frame whose centre lies in [minute − window/2, minute + window/2)."""
+    start = np.searchsorted(frame_time, minutes - window_s / 2 - 1e-6)
+    stop = np.searchsorted(frame_time, minutes + window_s / 2 - 1e-6)
+    return start, stop
+
+
+def coverage(
+    valid: np.ndarray, start: np.ndarray, stop: np.ndarray, minutes: np.ndarray, window_s: float, hop_s: float
+) -> np.ndarray:
+    """Share of the frames that a window should hold and does, 0 to 1 (float32).
+
+    Parameters
+    ----------
+    valid : bool array (n_frames), frames with data.
+    start, stop : from `window_bounds`.
+    minutes : s since 1970. window_s, hop_s : s; frames lie on UTC multiples of `hop_s` plus a constant.
+    """
+    total = np.concatenate([[0], np.cumsum(valid)])
+    expected = np.round(window_s / hop_s)
+    found = total[stop] - total[start]
+    return np.minimum(found / expected, 1.0).astype(np.float32)
+
+
+def log_mean_exp(values: np.ndarray, axis: int | tuple[int, ...], weights: np.ndarray | None = None) -> np.ndarray:
+    """Logarithm of the (weighted) mean of exp(values); NaN only where all of a slice is NaN."""
+    top = np.max(values, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    raised = np.exp(values - top)
+    if weights is None:
+        mean = raised.mean(axis=axis)
+    else:
+        mean = (raised * weights).sum(axis=axis) / weights.sum()
+    with np.errstate(divide="ignore"):
+        return np.log(mean) + np.squeeze(top, axis=axis)
+
+
+def azimuth_presence(azimuth_llr: np.ndarray) -> np.ndarray:
+    """Log marginal posterior ratio of presence, uniform prior over azimuth (paper's eq. 12)."""
+    return log_mean_exp(azimuth_llr, axis=-1)
+
+
+def range_rate_marginal(range_llr: np.ndarray) -> np.ndarray:
+    """Log-likelihood ratio against range alone: range rate marginalised over its uniform prior."""
+    return log_mean_exp(range_llr, axis=-1)
+
+
+def range_presence(range_llr: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+    """Log marginal posterior ratio of presence, prior proportional to range, uniform in range rate (eqs 20, 22)."""
+    return log_mean_exp(range_rate_marginal(range_llr), axis=-1, weights=np.maximum(range_m, 0.0))
+
+
+def detections(maps: LikelihoodMaps) -> pd.DataFrame:
+    """One row a minute: what the maps say, read off at their posterior's maximum (paper's eqs 13 and 23).
+
+    Parameters
+    ----------
+    maps : LikelihoodMaps with dims time and azimuth and/or range and range_rate.
+
+    Returns
+    -------
+    DataFrame with columns time, coverage, azimuth_deg, azimuth_llr, range_m, range_rate_mps, range_llr. The `_llr` columns
+    are log marginal posterior ratios of presence, filled where there is coverage; estimates are NaN where they are ≤ 0.
+    """
+    if "azimuth_llr" not in maps and "range_llr" not in maps:
+        raise LayoutError(f"likelihood maps hold azimuth_llr or range_llr, found {', '.join(map(str, maps)) or 'nothing'}")
+    count = maps.sizes["time"]
+    table = {
+        name: np.full(count, np.nan)
+        for name in ("azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr")
+    }
+    covered = np.zeros(count)
+    if "azimuth_llr" in maps:
+        there = maps["azimuth_coverage"].values > 0
+        covered = np.maximum(covered, maps["azimuth_coverage"].values)
+        llr = maps["azimuth_llr"].values
+        table["azimuth_llr"][there] = azimuth_presence(llr[there])
+        found = table["azimuth_llr"] > 0
+        table["azimuth_deg"][found] = _peak_azimuth(llr[found], maps["azimuth"].values)
+    if "range_llr" in maps:
+        there = maps["range_coverage"].values > 0
+        covered = np.maximum(covered, maps["range_coverage"].values)
+        range_m, rate = maps["range"].values, maps["range_rate"].values
+        llr = maps["range_llr"].values
+        table["range_llr"][there] = range_presence(llr[there], range_m)
+        found = table["range_llr"] > 0
+        with np.errstate(divide="ignore"):
+            posterior = llr[found] + np.log(np.maximum(range_m, 0.0))[None, :, None].astype(np.float32)
+        best = posterior.reshape(len(posterior), -1).argmax(axis=1) if found.any() else np.empty(0, int)
+        i, j = np.unravel_index(best, llr.shape[1:])
+        table["range_m"][found], table["range_rate_mps"][found] = range_m[i], rate[j]
+    return pd.DataFrame({"time": maps["time"].values, "coverage": covered, **table})
+
+
+def _peak_azimuth(llr: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Azimuth of the maximum, refined between grid points by a parabola through the peak and its neighbours."""
+    if not len(llr):
+        return np.empty(0)
+    best = llr.argmax(axis=1)
+    rows = np.arange(len(llr))
+    before, top, after = (llr[rows, (best + shift) % len(azimuth)] for shift in (-1, 0, 1))
+    bend = before - 2.0 * top + after
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, 1.0), 0.0)
+    return (azimuth[best] + np.clip(shift, -0.5, 0.5) * (azimuth[1] - azimuth[0])) % 360.0

@@ -1,0 +1,131 @@
+"""netCDF files that grow along time, block by block, in flat memory; CF-style, written aside and moved into place."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5netcdf
+import numpy as np
+import xarray as xr
+
+from obsnet.errors import OutputError
+from obsnet.layout import to_posix
+
+PACKED = {"range_llr": 0.05}
+"""Variables stored as 16-bit integers, and their resolution (CF `scale_factor`)."""
+
+_FILL = np.int16(-32768)
+
+
+class TimeWriter:
+    """Appends Datasets along their `time` dimension to one netCDF file; complex variables become real and imaginary ones.
+
+    The file appears under its name when the writer closes without an error, never before.
+    """
+
+    def __init__(self, path: str | Path, attrs: dict[str, Any] | None = None) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
+        self._attrs = attrs or {}
+        self._file: Any = None
+
+    def append(self, block: xr.Dataset) -> None:
+        """Write the next block; the first one sets variables, coordinates and dims."""
+        if not block.sizes.get("time", 0):
+            return
+        try:
+            if self._file is None:
+                self._file = self._create(block)
+            time = self._file.dimensions["time"].size
+            stop = time + block.sizes["time"]
+            self._file.resize_dimension("time", stop)
+            self._file.variables["time"][time:stop] = to_posix(block["time"].values)
+            for name, values in _real(block).items():
+                self._file.variables[name][time:stop] = _pack(name, values.transpose("time", ...).values)
+        except OSError as error:
+            raise OutputError(f"cannot write {self.path}: {error}") from None
+
+    def close(self) -> None:
+        """Finish the file and move it to its name."""
+        if self._file is None:
+            return
+        self._file.close()
+        self._file = None
+        os.replace(self._partial, self.path)
+
+    def __enter__(self) -> TimeWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+            return
+        if self._file is not None:
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
+
+    def _create(self, block: xr.Dataset) -> Any:
+        self._partial.parent.mkdir(parents=True, exist_ok=True)
+        file = h5netcdf.File(self._partial, "w")
+        file.attrs["Conventions"] = "CF-1.11"
+        for key, value in self._attrs.items():
+            file.attrs[key] = value
+        file.dimensions["time"] = None
+        time = file.create_variable("time", ("time",), "f8", chunks=(4096,))
+        time.attrs.update({"units": "seconds since 1970-01-01T00:00:00Z", "standard_name": "time", "calendar": "standard"})
+        for name, coordinate in block.coords.items():
+            if name == "time" or coordinate.dims != (name,):
+                continue
+            file.dimensions[name] = coordinate.size
+            variable = file.create_variable(str(name), (name,), "f8")
+            variable[:] = coordinate.values
+            variable.attrs.update(coordinate.attrs)
+        for name, values in _real(block).items():
+            values = values.transpose("time", ...)
+            packed = name in PACKED
+            rows = max(1, int(2**18 // max(np.prod(values.shape[1:]), 1)))
+            variable = file.create_variable(
+                name,
+                values.dims,
+                "i2" if packed else "f4",
+                chunks=(min(rows, 4096), *values.shape[1:]),
+                fillvalue=_FILL if packed else np.float32(np.nan),
+            )
+            variable.attrs.update(values.attrs)
+            if packed:
+                variable.attrs.update({"scale_factor": PACKED[name], "add_offset": 0.0})
+        return file
+
+
+def read(path: str | Path) -> xr.Dataset:
+    """Open a file of `TimeWriter` lazily; pairs ``x_real``, ``x_imag`` come back as complex ``x`` when loaded."""
+    return xr.open_dataset(path, engine="h5netcdf")
+
+
+def join_complex(dataset: xr.Dataset) -> xr.Dataset:
+    """Complex variables of a Dataset whose real and imaginary parts are variables of their own."""
+    names = [str(name).removesuffix("_real") for name in dataset if str(name).endswith("_real")]
+    joined = {name: dataset[f"{name}_real"] + 1j * dataset[f"{name}_imag"] for name in names}
+    return dataset.drop_vars([f"{name}_{part}" for name in names for part in ("real", "imag")]).assign(joined)
+
+
+def _real(block: xr.Dataset) -> dict[str, xr.DataArray]:
+    variables: dict[str, xr.DataArray] = {}
+    for key, values in block.data_vars.items():
+        name = str(key)
+        if np.iscomplexobj(values):
+            variables[f"{name}_real"] = values.real.assign_attrs(values.attrs)
+            variables[f"{name}_imag"] = values.imag.assign_attrs(values.attrs)
+        else:
+            variables[name] = values
+    return variables
+
+
+def _pack(name: str, values: np.ndarray) -> np.ndarray:
+    if name not in PACKED:
+        return values
+    scaled = np.rint(np.clip(values, -1600.0, 1600.0) / np.float32(PACKED[name]))
+    return np.where(np.isnan(scaled), np.float32(_FILL), scaled).astype(np.int16)

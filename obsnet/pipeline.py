@@ -1,0 +1,219 @@
+"""Spectra in, likelihood maps out, block by block: the stages between waveforms and trackers, with their memory.
+
+The same pipeline serves a batch run and a live station. Its output depends on the frames it was given, not on how they
+were cut into blocks, and its memory does not grow with the record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from obsnet.detectors.analytic import (
+    AnalyticAzimuthDetector,
+    AnalyticRangeDetector,
+    AzimuthDetectorConfig,
+    RangeDetectorConfig,
+)
+from obsnet.detectors.background import BackgroundDirection
+from obsnet.detectors.maps import LikelihoodMaps, detections, log_mean_exp, range_presence
+from obsnet.errors import ConfigError
+from obsnet.layout import from_posix, to_posix
+from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.ocean.rays import propagation
+from obsnet.ocean.sound_speed import OceanConfig
+from obsnet.signals.azigram import AzigramConfig, azigram
+from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstrogram
+from obsnet.signals.spectra import SpectraConfig
+from obsnet.signals.station import Station
+from obsnet.signals.waveforms import WaveformConfig
+from obsnet.trackers.grid_search import GridSearchConfig
+from obsnet.trackers.segmentation import SegmentationConfig
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Parameters of a whole run, one section per stage; the YAML of ``--config`` mirrors it."""
+
+    detector: Literal["learned", "analytic"] = "analytic"
+    tracker: Literal["grid", "bernoulli", "focalization"] = "grid"
+    waveforms: WaveformConfig = field(default_factory=WaveformConfig)
+    spectra: SpectraConfig = field(default_factory=SpectraConfig)
+    azigram: AzigramConfig = field(default_factory=AzigramConfig)
+    cepstrogram: CepstrogramConfig = field(default_factory=CepstrogramConfig)
+    azimuth: AzimuthDetectorConfig = field(default_factory=AzimuthDetectorConfig)
+    range: RangeDetectorConfig = field(default_factory=RangeDetectorConfig)
+    ocean: OceanConfig = field(default_factory=OceanConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    grid_search: GridSearchConfig = field(default_factory=GridSearchConfig)
+
+    def __post_init__(self) -> None:
+        if self.azimuth.step_s != self.range.step_s or self.azimuth.window_s != self.range.window_s:
+            raise ConfigError("azimuth and range detectors must share window_s and step_s")
+
+
+@dataclass(frozen=True)
+class Minutes:
+    """What the pipeline has finished: maps, presence ratios for the segmentation, and thinned representations to look at."""
+
+    maps: LikelihoodMaps
+    detections: pd.DataFrame
+    presence: pd.DataFrame
+    features: xr.Dataset
+
+
+class Pipeline:
+    """Turns consecutive blocks of spectra into likelihood maps at UTC multiples of the detectors' step.
+
+    Parameters
+    ----------
+    station : Station; its depth and the ocean's profile make the propagation table.
+    config : RunConfig
+    amplitudes : strength of each path pair against range; by default the paper's Table II scaled to the depth.
+    table : propagation table, if it is not to be made from `config.ocean`.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        config: RunConfig = RunConfig(),
+        amplitudes: Amplitudes | None = None,
+        table: xr.Dataset | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.station, self.config = station, config
+        ocean = config.ocean
+        self.table = table if table is not None else propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
+        amplitudes = amplitudes or Amplitudes.table_ii().scaled_to(station.depth_m)
+        self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
+        self._range = AnalyticRangeDetector(self.table, amplitudes, config.range, threads)
+        self._clutter = ClutterFilter(config.cepstrogram)
+        self._background = BackgroundDirection(config.azimuth.background_window_s, config.azimuth.background_step_s)
+        self._azigram: xr.DataArray | None = None
+        self._null: np.ndarray | None = None
+        self._cepstrogram: xr.DataArray | None = None
+        self._spectrogram: xr.DataArray | None = None
+        self._next: float | None = None
+
+    def push(self, spectra: xr.Dataset) -> Minutes | None:
+        """Take the next block of spectra; return the minutes that it finishes, or none."""
+        if not spectra.sizes["time"]:
+            return None
+        times = to_posix(spectra["time"].values)
+        if self._next is None:
+            self._next = float(np.ceil(times[0] / self.config.azimuth.step_s) * self.config.azimuth.step_s)
+        self._take(spectra)
+        ready = times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2
+        return self._finish(ready)
+
+    def flush(self) -> Minutes | None:
+        """Finish the last minutes of a record, whose windows reach beyond its end."""
+        held = self._spectrogram
+        if held is None or not held.sizes["time"]:
+            return None
+        return self._finish(float(to_posix(held["time"].values[-1])))
+
+    def _take(self, spectra: xr.Dataset) -> None:
+        if "east" in spectra and "north" in spectra:
+            azimuths = azigram(spectra, self.config.azigram)
+            null = self._background(azimuths) if self.config.azimuth.null == "directional" else None
+            self._null = null if self._null is None else _join(self._null, null)
+            self._azigram = _concat(self._azigram, azimuths)
+        if "p" in spectra:
+            self._cepstrogram = _concat(self._cepstrogram, self._clutter(cepstrogram(spectra)))
+        self._spectrogram = _concat(self._spectrogram, _power(spectra))
+
+    def _finish(self, ready: float) -> Minutes | None:
+        step = self.config.azimuth.step_s
+        count = int(np.floor((ready - self._next) / step + 1e-6)) + 1
+        if count <= 0:
+            return None
+        minutes = self._next + step * np.arange(count)
+        parts = []
+        if self._azigram is not None:
+            parts.append(self._azimuth.maps(self._azigram, minutes, self._null))
+        if self._cepstrogram is not None:
+            parts.append(self._range.maps(self._cepstrogram, minutes))
+        if not parts:
+            raise ConfigError(f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with")
+        maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
+        maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
+        result = Minutes(maps, detections(maps), presence(maps), self._features(minutes))
+        self._next = float(minutes[-1] + step)
+        self._forget(self._next - self.config.azimuth.window_s / 2)
+        return result
+
+    def _features(self, minutes: np.ndarray) -> xr.Dataset:
+        """Spectrogram, azigram and cepstrogram thinned to one column a minute, for the eye."""
+        features = {}
+        step = self.config.azimuth.step_s
+        for name, held in (("power", self._spectrogram), ("azigram", self._azigram), ("cepstrogram", self._cepstrogram)):
+            if held is not None:
+                features[name] = _per_minute(held, minutes, step)
+        return xr.Dataset(features).assign_coords(time=from_posix(minutes))
+
+    def _forget(self, before: float) -> None:
+        if self._azigram is not None:
+            keep = to_posix(self._azigram["time"].values) >= before
+            self._azigram = self._azigram[:, keep]
+            self._null = None if self._null is None else self._null[:, keep]
+        if self._cepstrogram is not None:
+            self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
+        self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+
+
+def presence(maps: LikelihoodMaps) -> pd.DataFrame:
+    """Log presence ratios of the maps, as the segmentation takes them: indexed by s since 1970."""
+    columns = {}
+    if "azimuth_llr" in maps:
+        columns["azimuth"] = log_mean_exp(maps["azimuth_llr"].values, axis=-1)
+    if "range_llr" in maps:
+        llr, range_m, rate = maps["range_llr"].values, maps["range"].values, maps["range_rate"].values
+        columns["range"] = range_presence(llr, range_m)
+        columns["approaching"] = range_presence(llr[:, :, rate <= 0], range_m)
+        columns["leaving"] = range_presence(llr[:, :, rate >= 0], range_m)
+    return pd.DataFrame(columns, index=to_posix(maps["time"].values))
+
+
+def _power(spectra: xr.Dataset) -> xr.DataArray:
+    """Power of the pressure (or of the ground motion without one) in bins of eight, so that a minute is small."""
+    values = spectra["p"] if "p" in spectra else spectra[next(name for name in ("down", "north", "east") if name in spectra)]
+    power = values.values.real**2 + values.values.imag**2
+    bins = power.shape[0] // 8
+    thinned = power[: bins * 8].reshape(bins, 8, -1).mean(axis=1)
+    centre = spectra["frequency"].values[: bins * 8].reshape(bins, 8).mean(axis=1)
+    coords = {"spectrogram_frequency": centre, "time": spectra["time"].values}
+    return xr.DataArray(thinned, dims=("spectrogram_frequency", "time"), coords=coords, name="power")
+
+
+def _per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.DataArray:
+    """Mean of the frames within half a step of each minute; NaN where there is none."""
+    times = to_posix(frames["time"].values)
+    edges = np.searchsorted(times, np.append(minutes - step / 2, minutes[-1] + step / 2))
+    values = frames.values
+    valid = ~np.isnan(values[0])
+    total = np.concatenate([np.zeros((len(values), 1), values.dtype), np.cumsum(np.where(valid, values, 0), axis=1)], axis=1)
+    count = np.concatenate([[0], np.cumsum(valid)])
+    number = count[edges[1:]] - count[edges[:-1]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (total[:, edges[1:]] - total[:, edges[:-1]]) / number
+    mean[:, number == 0] = np.nan
+    dim = frames.dims[0]
+    return xr.DataArray(mean, dims=(dim, "time"), coords={dim: frames[dim].values, "time": from_posix(minutes)}, attrs=frames.attrs)
+
+
+def _concat(held: xr.DataArray | None, new: xr.DataArray) -> xr.DataArray:
+    if held is None or not held.sizes["time"]:
+        return new
+    dim = new.dims[0]
+    coords = {dim: new[dim].values, "time": np.concatenate([held["time"].values, new["time"].values])}
+    values = np.concatenate([held.values, new.values], axis=1)
+    return xr.DataArray(values, dims=new.dims, coords=coords, name=new.name, attrs=new.attrs)
+
+
+def _join(held: np.ndarray, new: np.ndarray | None) -> np.ndarray | None:
+    return None if new is None else np.concatenate([held, new], axis=1)

@@ -1,0 +1,403 @@
+"""A whole run: waveforms and station metadata in, maps, detections and tracks out; in memory or into a folder.
+
+``obsnet.track(stream, station)`` in Python and ``obsnet track`` on the command line are this module.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+import obsnet
+from obsnet import netcdf
+from obsnet.config import to_dict
+from obsnet.detectors.maps import LikelihoodMaps
+from obsnet.errors import OutputError
+from obsnet.layout import from_posix, iso, to_posix
+from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.ocean.rays import strongest_delay
+from obsnet.pipeline import Minutes, Pipeline, RunConfig
+from obsnet.signals.spectra import iter_spectra
+from obsnet.signals.station import Station
+from obsnet.signals.waveforms import open_waveforms
+from obsnet.trackers.grid_search import search
+from obsnet.trackers.segmentation import segments
+from obsnet.trackers.track import Segment, Track
+
+if TYPE_CHECKING:
+    import obspy
+
+BLOCK_S = 10800.0
+"""Length of the blocks in which a record streams through."""
+
+Progress = Callable[[float, float], None]
+"""Called with seconds of record done and in all."""
+
+
+@dataclass
+class Run:
+    """What a run found, and how.
+
+    Attributes
+    ----------
+    station : Station
+    maps : LikelihoodMaps (lazily read from disk after a run into a folder).
+    features : Dataset of power, azigram and cepstrogram, one column a minute.
+    detections : DataFrame, one row a minute, the columns of detections.csv.
+    presence : DataFrame of log presence ratios, indexed by s since 1970.
+    segments : list of Segment. tracks : list of Track.
+    table : propagation table. info : what run.json holds.
+    """
+
+    station: Station
+    config: RunConfig
+    maps: LikelihoodMaps
+    features: xr.Dataset
+    detections: pd.DataFrame
+    presence: pd.DataFrame
+    segments: list[Segment]
+    tracks: list[Track]
+    table: xr.Dataset
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def delay(self, range_m: np.ndarray) -> np.ndarray:
+        """Travel time [s] of the loudest path against range [m]."""
+        return travel_time(self.table)(range_m)
+
+    def write(self, folder: str | Path) -> None:
+        """Write detections, tracks, maps, features, run.json and report.png into a folder, each file atomically."""
+        folder = prepare_folder(folder)
+        for name, dataset in (("maps", self.maps), ("features", self.features)):
+            target = folder / f"{name}.nc"
+            if target.exists() and dataset.encoding.get("source") == str(target):
+                continue
+            with netcdf.TimeWriter(target, {"station": self.station.code}) as writer:
+                writer.append(dataset)
+        write_tables(self, folder)
+        self.plot(folder / "report.png")
+
+    def plot(self, path: str | Path | None = None, reference: list | None = None) -> Any:
+        """The report figure; saved to `path` if given."""
+        from obsnet.plots import report
+
+        return report(self, path, reference=reference)
+
+
+def detect(
+    stream: obspy.Stream | str | Path | list,
+    station: Station,
+    config: RunConfig = RunConfig(),
+    **options: Any,
+) -> Run:
+    """Waveforms to likelihood maps and detections, without tracking; options as for `track`."""
+    return _run(stream, station, config, tracking=False, **options)
+
+
+def track(
+    stream: obspy.Stream | str | Path | list,
+    station: Station,
+    config: RunConfig | None = None,
+    *,
+    detector: str | None = None,
+    **options: Any,
+) -> Run:
+    """Waveforms to tracks.
+
+    Parameters
+    ----------
+    stream : obspy Stream, or path(s) of files, folders or an SDS archive.
+    station : Station, for instance from `Station.from_stationxml`.
+    config : RunConfig, defaults of the core paper.
+    detector : 'learned' or 'analytic'; overrides `config.detector`.
+    starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
+    amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
+    folder : write maps and features there block by block, so that memory stays flat with record length.
+    progress : called with seconds done and in all. threads : for the compiled loops.
+
+    Returns
+    -------
+    Run. No ship found is an empty `tracks`.
+
+    Raises
+    ------
+    ObsnetError : the waveforms, the station or the configuration cannot serve.
+    """
+    from dataclasses import replace
+
+    config = config or RunConfig()
+    if detector is not None:
+        config = replace(config, detector=detector)
+    return _run(stream, station, config, tracking=True, **options)
+
+
+def _run(
+    waveforms: Any,
+    station: Station,
+    config: RunConfig,
+    *,
+    tracking: bool,
+    starttime: Any = None,
+    endtime: Any = None,
+    amplitudes: Amplitudes | None = None,
+    table: xr.Dataset | None = None,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
+    threads: int | None = None,
+) -> Run:
+    clock = _Clock()
+    threads = threads or os.cpu_count() or 1
+    source = open_waveforms(waveforms, station, config.waveforms, starttime, endtime)
+    clock.lap("open")
+    pipeline = Pipeline(station, config, amplitudes, table, threads)
+    clock.lap("model")
+    sink = _FolderSink(folder, station) if folder is not None else _MemorySink()
+    with sink:
+        for minutes in _stream(source, station, config, pipeline, progress, clock):
+            sink.append(minutes)
+            clock.lap("write")
+        maps, features = sink.close()
+    run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
+    if tracking and len(run.presence):
+        run.segments, run.tracks = find_tracks(run, threads)
+        clock.lap("track")
+    run.info = _describe(run, source, clock)
+    return run
+
+
+def _stream(source, station, config, pipeline, progress, clock) -> Iterator[Minutes]:
+    for spectra in iter_spectra(source, station, config.spectra, BLOCK_S):
+        clock.lap("spectra")
+        minutes = pipeline.push(spectra)
+        clock.lap("detect")
+        if progress is not None and spectra.sizes["time"]:
+            done = float(to_posix(spectra["time"].values[-1])) - source.start
+            progress(done, source.end - source.start)
+        if minutes is not None:
+            yield minutes
+    minutes = pipeline.flush()
+    clock.lap("detect")
+    if minutes is not None:
+        yield minutes
+
+
+def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
+    """Segments of a run's presence and the tracks within them, in time order."""
+    delay = travel_time(run.table)
+    found = segments(run.presence, run.config.segmentation)
+    tracks: list[Track] = []
+    for segment in found:
+        window = slice(from_posix(segment.start - 1.0), from_posix(segment.end + 1.0))
+        part = run.maps.sel(time=window).load()
+        tracks += search(part, segment, delay, run.config.grid_search, threads)
+    return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
+
+
+def travel_time(table: xr.Dataset) -> Callable[[np.ndarray], np.ndarray]:
+    """Travel time [s] of the loudest path against range [m], carried on at its last slope beyond the table."""
+    delay = strongest_delay(table).dropna("range")
+    grid, values = delay["range"].values.astype(float), delay.values.astype(float)
+    slope = (values[-1] - values[-2]) / (grid[-1] - grid[-2])
+
+    def at(range_m: np.ndarray) -> np.ndarray:
+        distance = np.abs(np.asarray(range_m, float))
+        beyond = np.maximum(distance - grid[-1], 0.0)
+        return np.interp(distance, grid, values) + slope * beyond
+
+    return at
+
+
+class _MemorySink:
+    """Collects minutes in memory."""
+
+    def __init__(self) -> None:
+        self._minutes: list[Minutes] = []
+
+    def append(self, minutes: Minutes) -> None:
+        self._minutes.append(minutes)
+
+    def close(self) -> tuple[xr.Dataset, xr.Dataset]:
+        def joined(datasets: list[xr.Dataset]) -> xr.Dataset:
+            if not datasets:
+                return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
+            return xr.concat(datasets, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
+
+        return joined([m.maps for m in self._minutes]), joined([m.features for m in self._minutes])
+
+    def detections(self) -> pd.DataFrame:
+        frames = [m.detections for m in self._minutes]
+        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=DETECTION_COLUMNS)
+
+    def presence(self) -> pd.DataFrame:
+        return pd.concat([m.presence for m in self._minutes]) if self._minutes else pd.DataFrame()
+
+    def __enter__(self) -> _MemorySink:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        return None
+
+
+class _FolderSink(_MemorySink):
+    """Writes maps and features to disk as they come; keeps the small tables."""
+
+    def __init__(self, folder: str | Path, station: Station) -> None:
+        super().__init__()
+        self._folder = prepare_folder(folder)
+        attrs = {"station": station.code, "source": f"obsnet {obsnet.__version__}"}
+        self._writers = [netcdf.TimeWriter(self._folder / f"{name}.nc", attrs) for name in ("maps", "features")]
+
+    def append(self, minutes: Minutes) -> None:
+        self._writers[0].append(minutes.maps)
+        self._writers[1].append(minutes.features)
+        empty = xr.Dataset()
+        self._minutes.append(Minutes(empty, minutes.detections, minutes.presence, empty))
+
+    def close(self) -> tuple[xr.Dataset, xr.Dataset]:
+        if not self._minutes:
+            return _MemorySink().close()
+        for writer in self._writers:
+            writer.close()
+        maps, features = (netcdf.read(self._folder / f"{name}.nc") for name in ("maps", "features"))
+        return maps, netcdf.join_complex(features)
+
+    def __exit__(self, *error: Any) -> None:
+        for writer in self._writers:
+            writer.__exit__(*error)
+
+
+DETECTION_COLUMNS = ["time", "coverage", "azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr"]
+TRACK_COLUMNS = [
+    "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
+    "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
+]  # fmt: skip
+
+
+def prepare_folder(folder: str | Path) -> Path:
+    """Make an output folder; `OutputError` if it is a file or cannot be written."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"output {folder} is a file; give a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".probe.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write into {folder}: {error.strerror}") from None
+    return folder
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a small file aside and move it into place."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def write_tables(run: Run, folder: Path) -> None:
+    """Write detections.csv, tracks.csv, tracks.geojson and run.json."""
+    write_text(folder / "detections.csv", detections_csv(run.detections))
+    rows = pd.DataFrame([found.row(i) for i, found in enumerate(run.tracks, 1)], columns=TRACK_COLUMNS)
+    write_text(folder / "tracks.csv", rows.to_csv(index=False, float_format="%.6g"))
+    write_text(folder / "tracks.geojson", json.dumps(geojson(run.tracks, run.station)))
+    write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
+
+
+def detections_csv(detections: pd.DataFrame) -> str:
+    """Text of detections.csv: ISO times, empty cells where there is no estimate."""
+    table = detections.reindex(columns=DETECTION_COLUMNS).copy()
+    stamps = table["time"].to_numpy("datetime64[s]")
+    table["time"] = np.char.add(np.datetime_as_string(stamps), "Z") if len(stamps) else table["time"]
+    digits = {"coverage": 3, "azimuth_deg": 2, "azimuth_llr": 3, "range_m": 1, "range_rate_mps": 2, "range_llr": 3}
+    return table.round(digits).to_csv(index=False)
+
+
+def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
+    """Tracks as timed LineStrings in WGS 84 (a FeatureCollection, RFC 7946)."""
+    from pyproj import Proj
+
+    local = Proj(proj="aeqd", lat_0=station.latitude, lon_0=station.longitude, datum="WGS84")
+    features = []
+    for number, found in enumerate(tracks, 1):
+        if not np.isfinite(found.std[2]):
+            continue
+        times, east, north = found.positions(300.0)
+        longitude, latitude = local(east, north, inverse=True)
+        properties = {key: None if value != value else value for key, value in found.row(number).items()}
+        properties["times"] = [iso(t) for t in times]
+        properties["method"] = found.method
+        coordinates = [[round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)]
+        line = {"type": "LineString", "coordinates": coordinates}
+        features.append({"type": "Feature", "geometry": line, "properties": properties})
+    return {"type": "FeatureCollection", "features": features}
+
+
+class _Clock:
+    """Seconds spent per stage."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+def _describe(run: Run, source: Any, clock: _Clock) -> dict[str, Any]:
+    scale = 1024 if sys.platform != "darwin" else 1024**2
+    return {
+        "obsnet": obsnet.__version__,
+        "versions": {name: _version(name) for name in ("numpy", "scipy", "numba", "xarray", "obspy")},
+        "python": platform.python_version(),
+        "station": {
+            "code": run.station.code,
+            "latitude": run.station.latitude,
+            "longitude": run.station.longitude,
+            "depth_m": run.station.depth_m,
+        },
+        "waveforms": source.report.to_dict(),
+        "start": iso(source.start),
+        "end": iso(source.end),
+        "config": to_dict(run.config),
+        "models": {},
+        "segments": [
+            {"start": iso(s.start), "end": iso(s.end), "cpa": None if s.cpa is None else iso(s.cpa)} for s in run.segments
+        ],
+        "tracks": len(run.tracks),
+        "notes": _notes(run),
+        "seconds": {stage: round(value, 3) for stage, value in clock.stages.items()},
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale, 1),
+    }
+
+
+def _notes(run: Run) -> list[str]:
+    notes = []
+    if len(run.presence) and "azimuth" not in run.presence:
+        notes.append("no two horizontals: range only, courses are not observed")
+    if len(run.presence) and "range" not in run.presence:
+        notes.append("no hydrophone: azimuth from polarisation, ambiguous by 180°, no range")
+    return notes
+
+
+def _version(package: str) -> str:
+    from importlib.metadata import version
+
+    return version(package)

@@ -1,0 +1,188 @@
+"""Spectra in, cepstrogram out: the delays between the paths by which the ship's noise arrives.
+
+Echoes appear as ridges that drift with the ship; the ship's own harmonics and the instrument stay put. The clutter filter
+removes what stays put. Its output at a time depends on the window before that time alone, never on where a chunk or a
+file begins, so that a live station and a batch run agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.fft
+import scipy.linalg
+import xarray as xr
+
+from obsnet.errors import ConfigError, LayoutError
+from obsnet.layout import SPECTRA, require, to_posix
+
+
+@dataclass(frozen=True)
+class CepstrogramConfig:
+    """Clutter filter: kind, length of the window it learns from, and how often it learns anew (seconds)."""
+
+    clutter: Literal["svd", "mean", "none"] = "svd"
+    clutter_window_s: float = 10800.0
+    clutter_step_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.clutter_step_s <= self.clutter_window_s:
+            raise ConfigError(
+                "clutter_step_s must be positive and at most clutter_window_s, found "
+                f"{self.clutter_step_s} and {self.clutter_window_s} s"
+            )
+
+
+def cepstrogram(spectra: xr.Dataset) -> xr.DataArray:
+    """Real cepstrum of every frame of the hydrophone, before any clutter filter.
+
+    Parameters
+    ----------
+    spectra : Dataset with p [Pa], dims (frequency, time), frequencies from 0 to Nyquist.
+
+    Returns
+    -------
+    DataArray float32, dims (quefrency [s], time), non-negative quefrencies up to half the frame; NaN in gaps.
+
+    Source: Trabattoni et al. 2023, eq. (14): inverse real FFT of log|S|.
+    """
+    require(spectra, SPECTRA)
+    if "p" not in spectra:
+        raise LayoutError("a cepstrogram needs the hydrophone (p), which is missing from the spectra")
+    frequency = spectra["frequency"].values
+    modulus = np.abs(spectra["p"].values.T)
+    floor = np.finfo(np.float32).tiny
+    log_modulus = np.log(np.maximum(modulus, floor))
+    nfft = 2 * (frequency.size - 1)
+    cepstrum = scipy.fft.irfft(log_modulus, n=nfft, axis=1)[:, : nfft // 2 + 1]
+    step = 1.0 / (2.0 * frequency[-1])
+    return xr.DataArray(
+        np.ascontiguousarray(cepstrum.T, dtype=np.float32),
+        dims=("quefrency", "time"),
+        coords={"quefrency": step * np.arange(nfft // 2 + 1), "time": spectra["time"].values},
+        name="cepstrogram",
+        attrs={"long_name": "real cepstrum of the pressure", "units": "1", "nfft": nfft},
+    )
+
+
+def noise_std(quefrency_s: np.ndarray, nfft: int) -> np.ndarray:
+    """Standard deviation of the cepstrum of noise under a Hann window (paper's eq. 15).
+
+    >>> float(noise_std(np.array([0.0, 10.24]), 1024)[1])
+    0.01328125
+    """
+    quefrency = np.asarray(quefrency_s, float)
+    return (0.625 + 0.2 * np.cos(np.pi * quefrency / quefrency[-1])) / np.sqrt(nfft)
+
+
+class ClutterFilter:
+    """Removes from each cepstrum what was the same over the window before it.
+
+    Every `clutter_step_s` (on UTC multiples) the filter learns a basis from the valid frames of the `clutter_window_s`
+    before; the frames until the next such instant are projected off it. A station that has heard fewer than
+    `WARM_UP_FRAMES` frames in that window does not know its clutter: its frames are NaN, which costs coverage.
+
+    Parameters
+    ----------
+    config : CepstrogramConfig
+
+    Notes
+    -----
+    Source: Trabattoni et al. 2023, appendix A, singular values before the knee set to zero. Removing the leading left
+    singular vectors of a window from a frame is the same projection; learning it from the past makes it causal.
+    The eigenvectors of the Gram matrix over quefrency replace the full SVD.
+    """
+
+    WARM_UP_FRAMES = 30
+
+    def __init__(self, config: CepstrogramConfig = CepstrogramConfig()) -> None:
+        self.config = config
+        self._time = np.empty(0)
+        self._frames = np.empty((0, 0), np.float32)
+        self._learned: np.ndarray | None = None
+
+    def __call__(self, cepstra: xr.DataArray) -> xr.DataArray:
+        """Filter the next block of frames, dims (quefrency, time); blocks must come in time order."""
+        if self.config.clutter == "none":
+            return cepstra
+        time = to_posix(cepstra["time"].values)
+        values = np.ascontiguousarray(cepstra.values.T)
+        if self._frames.shape[1] != values.shape[1]:
+            self._frames = np.empty((0, values.shape[1]), np.float32)
+        filtered = np.full_like(values, np.nan)
+        done = 0
+        while done < len(time):
+            if self._is_due(time[done]):
+                self._learn(time[done])
+            end = self._next_instant(time, values, done)
+            if self._learned is not None:
+                filtered[done:end] = self._project(values[done:end])
+            self._remember(time[done:end], values[done:end])
+            done = end
+        return cepstra.copy(data=np.ascontiguousarray(filtered.T))
+
+    def _is_due(self, time: float) -> bool:
+        if self._learned is None:
+            return len(self._frames) >= self.WARM_UP_FRAMES
+        step = self.config.clutter_step_s
+        return np.floor(time / step) > np.floor(self._time[-1] / step)
+
+    def _next_instant(self, time: np.ndarray, values: np.ndarray, done: int) -> int:
+        """First frame from `done` + 1 on before which the filter must look whether to learn anew."""
+        step = self.config.clutter_step_s
+        end = int(np.searchsorted(time, (np.floor(time[done] / step) + 1.0) * step))
+        if self._learned is None:
+            valid = np.cumsum(~np.isnan(values[done:end, 0])) + len(self._frames)
+            end = min(end, done + 1 + int(np.searchsorted(valid, self.WARM_UP_FRAMES)))
+        return max(end, done + 1)
+
+    def _learn(self, instant: float) -> None:
+        recent = self._time >= instant - self.config.clutter_window_s
+        self._time, self._frames = self._time[recent], self._frames[recent]
+        if len(self._frames) < self.WARM_UP_FRAMES:
+            self._learned = None
+        elif self.config.clutter == "svd":
+            self._learned = leading_basis(self._frames)
+        else:
+            self._learned = self._frames.mean(axis=0)
+
+    def _project(self, frames: np.ndarray) -> np.ndarray:
+        if self.config.clutter == "svd":
+            return frames - (frames @ self._learned) @ self._learned.T
+        return frames - self._learned
+
+    def _remember(self, time: np.ndarray, frames: np.ndarray) -> None:
+        valid = ~np.isnan(frames[:, 0])
+        self._time = np.concatenate([self._time, time[valid]])
+        self._frames = np.concatenate([self._frames, frames[valid]])
+
+
+def leading_basis(frames: np.ndarray) -> np.ndarray:
+    """Orthonormal vectors over quefrency before the knee of the singular values.
+
+    Parameters
+    ----------
+    frames : array (n_frames, n_quefrency), without gaps.
+
+    Returns
+    -------
+    array float32 (n_quefrency, n_kept): the singular vectors whose singular values come before the knee.
+    """
+    gram = frames.T @ frames
+    values, vectors = scipy.linalg.eigh(gram, check_finite=False)
+    singular = np.sqrt(np.maximum(values[::-1], 0.0))[: min(frames.shape)]
+    keep = knee(singular)
+    return np.ascontiguousarray(vectors[:, ::-1][:, :keep], dtype=np.float32)
+
+
+def knee(decreasing: np.ndarray) -> int:
+    """Index of the knee of a decreasing curve, normalised on both axes (kneedle, Satopaa et al. 2011).
+
+    >>> knee(np.array([10.0, 1.0, 0.9, 0.8, 0.7, 0.6]))
+    1
+    """
+    y = decreasing / decreasing[0] if decreasing[0] > 0 else decreasing
+    x = np.linspace(0.0, 1.0, len(decreasing))
+    return int(np.argmax(1.0 - y - x))

@@ -1,0 +1,129 @@
+"""The loops of the grid search, compiled: where a hypothesis puts the ship at each tile, and what the maps say there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _lookup(table, step, x):
+    position = x / step
+    i = int(position)
+    if i >= table.shape[0] - 1:
+        return table[table.shape[0] - 1]
+    mu = position - i
+    return (1.0 - mu) * table[i] + mu * table[i + 1]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _emitted(heard, cpa_range, speed, delay, delay_step):
+    """Emission time, relative to CPA, of what is heard `heard` seconds after CPA: solves e + τ(R(e)) = heard."""
+    emitted = heard
+    for _ in range(3):
+        distance = np.sqrt(cpa_range * cpa_range + speed * speed * emitted * emitted)
+        emitted = heard - _lookup(delay, delay_step, distance)
+    return emitted
+
+
+@njit(cache=True, nogil=True)
+def tabulate(offset, cpa_range, speed, delay, delay_step, distance, rate, bearing):
+    """Range [m], range rate [m/s] and azimuth minus course [deg] for every (CPA range, speed, time heard after CPA).
+
+    Outputs are (n_cpa_range, n_speed, n_offset) float32, overwritten.
+    """
+    for i in range(cpa_range.shape[0]):
+        for j in range(speed.shape[0]):
+            for k in range(offset.shape[0]):
+                emitted = _emitted(offset[k], cpa_range[i], speed[j], delay, delay_step)
+                along = speed[j] * emitted
+                r = np.sqrt(cpa_range[i] * cpa_range[i] + along * along)
+                distance[i, j, k] = r
+                rate[i, j, k] = speed[j] * along / max(r, 1.0)
+                bearing[i, j, k] = np.rad2deg(np.arctan2(cpa_range[i], along))
+
+
+@njit(cache=True, nogil=True)
+def sum_scores(index, distance, rate, bearing, range_score, geometry, azimuth_score, azimuth_step, course_start, out):
+    """Score of every (CPA time, CPA range, speed, course): the greatest sum over any run of consecutive tiles.
+
+    The best run is the stretch over which the hypothesis is heard; a ship need not be heard for the whole segment.
+
+    Parameters
+    ----------
+    index : (n_cpa_time, n_tiles) position of each tile on the offset axis of the tables.
+    distance, rate, bearing : tables of `tabulate`.
+    range_score : (n_tiles, n_range, n_rate); geometry : range origin, range step, rate origin, rate step. Off the grid is 0.
+    azimuth_score : (n_tiles, n_phases, length) polyphase rows: azimuth bin b is [b % n_phases, b // n_phases], wrapped on so
+        that the courses of one hypothesis lie side by side.
+    out : (n_cpa_time, n_cpa_range, n_speed, n_course) float32, overwritten.
+    """
+    n_tiles = index.shape[1]
+    n_range, n_rate = range_score.shape[1], range_score.shape[2]
+    phases = azimuth_score.shape[1]
+    bins = int(round(360.0 / azimuth_step))
+    n_course = out.shape[3]
+    run = np.empty(n_course, np.float32)
+    for t in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                row = out[t, i, j]
+                row[:] = 0.0
+                run[:] = 0.0
+                for m in range(n_tiles):
+                    k = index[t, m]
+                    share = np.float32(0.0)
+                    x = (distance[i, j, k] - geometry[0]) / geometry[1]
+                    y = (rate[i, j, k] - geometry[2]) / geometry[3]
+                    a, b = int(np.floor(x)), int(np.floor(y))
+                    if a >= 0 and b >= 0 and a < n_range - 1 and b < n_rate - 1:
+                        u, v = np.float32(x - a), np.float32(y - b)
+                        share = (1 - u) * (
+                            (1 - v) * range_score[m, a, b] + v * range_score[m, a, b + 1]
+                        ) + u * ((1 - v) * range_score[m, a + 1, b] + v * range_score[m, a + 1, b + 1])
+                    azimuth = bearing[i, j, k] + course_start
+                    c = int(np.round(azimuth / azimuth_step)) % bins
+                    source = azimuth_score[m, c % phases]
+                    first = c // phases
+                    for q in range(n_course):
+                        run[q] = max(run[q] + share + source[first + q], np.float32(0.0))
+                        row[q] = max(row[q], run[q])
+
+
+@njit(cache=True, nogil=True)
+def score_points(points, tiles, delay, delay_step, range_score, geometry, azimuth_score, azimuth_step, per_tile, out):
+    """Score of each hypothesis of a list (as in `sum_scores`), both maps interpolated linearly.
+
+    Parameters
+    ----------
+    points : (n, 4) CPA time [s on the clock of `tiles`], signed CPA range [m], course [deg], speed [m/s].
+    azimuth_score : (n_tiles, n_azimuth). per_tile : (n_tiles, n) filled with each tile's share if it has n columns.
+    out : (n) float64, overwritten.
+    """
+    n_range, n_rate = range_score.shape[1], range_score.shape[2]
+    bins = azimuth_score.shape[1]
+    for p in range(points.shape[0]):
+        cpa_time, cpa_range, course, speed = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
+        out[p] = 0.0
+        run = 0.0
+        for m in range(tiles.shape[0]):
+            emitted = _emitted(tiles[m] - cpa_time, cpa_range, speed, delay, delay_step)
+            along = speed * emitted
+            r = np.sqrt(cpa_range * cpa_range + along * along)
+            share = 0.0
+            x = (r - geometry[0]) / geometry[1]
+            y = (speed * along / max(r, 1.0) - geometry[2]) / geometry[3]
+            a, b = int(np.floor(x)), int(np.floor(y))
+            if a >= 0 and b >= 0 and a < n_range - 1 and b < n_rate - 1:
+                u, v = x - a, y - b
+                share += (1 - u) * ((1 - v) * range_score[m, a, b] + v * range_score[m, a, b + 1]) + u * (
+                    (1 - v) * range_score[m, a + 1, b] + v * range_score[m, a + 1, b + 1]
+                )
+            z = ((course + np.rad2deg(np.arctan2(cpa_range, along))) % 360.0) / azimuth_step
+            c = int(np.floor(z))
+            w = z - c
+            share += (1 - w) * azimuth_score[m, c % bins] + w * azimuth_score[m, (c + 1) % bins]
+            if per_tile.shape[1] > p:
+                per_tile[m, p] = share
+            run = max(run + share, 0.0)
+            out[p] = max(out[p], run)
