@@ -1,0 +1,191 @@
+"""Ambient noise of the deep sea floor: isotropic and partly directional sea noise, microseism, sensors' own
+noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsnet.errors import ConfigError
+from obsnet.twin.noise import Wander, below_nyquist, gaussian_noise
+from obsnet.twin.propagate import Field
+
+IMPEDANCE = 1030.0 * 1520.0
+REFERENCE_HZ = 15.0
+LEVEL_KNOT_S = 4.0
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Levels and directions of the background.
+
+    Parameters
+    ----------
+    level_db : float
+        PSD of the sea noise's pressure at 15 Hz, dB re 1 µPa²/Hz.
+    slope_db : float
+        Its fall, dB per decade.
+    level_spread_db : float
+        Standard deviation of its slow changes.
+    microseism_db : float
+        PSD of the microseism's peak, dB re 1 µPa²/Hz (140–155 on deep sea floors); −inf is none.
+    microseism_hz : float
+        Frequency of the peak.
+    directional_fraction : float
+        Share of the sea noise's pressure power that comes from one azimuth.
+    directional_azimuth_deg : float
+        Azimuth from the station to where that comes from.
+    directional_elevation_deg : float
+        Grazing angle at which it arrives.
+    horizontal_share : float
+        PSD of either horizontal velocity of the isotropic part over that of a plane wave of the same
+        pressure: 1/3 in a three-dimensionally isotropic field.
+    vertical_coherence : float
+        Coherence of pressure and downward velocity: noise comes from the surface.
+    hydrophone_noise_db : float
+        Own noise of the hydrophone at 10 Hz, dB re 1 µPa²/Hz, growing as 1/f below.
+    seismometer_noise_db : float
+        Own noise of the seismometer, dB re 1 (m/s²)²/Hz.
+    tilt_noise_db : float
+        Noise of currents on the horizontals at 0.1 Hz, dB re 1 (m/s²)²/Hz, falling 30 dB per decade.
+    """
+
+    level_db: float = 78.0
+    slope_db: float = 18.0
+    level_spread_db: float = 1.0
+    microseism_db: float = 146.0
+    microseism_hz: float = 0.22
+    directional_fraction: float = 0.15
+    directional_azimuth_deg: float = 90.0
+    directional_elevation_deg: float = 20.0
+    horizontal_share: float = 1 / 3
+    vertical_coherence: float = 0.4
+    hydrophone_noise_db: float = 48.0
+    seismometer_noise_db: float = -165.0
+    tilt_noise_db: float = -125.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.directional_fraction <= 1:
+            raise ConfigError(
+                f"directional_fraction must lie between 0 and 1, found {self.directional_fraction}"
+            )
+        if not 0 <= self.vertical_coherence <= 1:
+            raise ConfigError(f"vertical_coherence must lie between 0 and 1, found {self.vertical_coherence}")
+        if not self.microseism_hz > 0:
+            raise ConfigError(f"microseism_hz must be positive, found {self.microseism_hz}")
+
+    @classmethod
+    def isotropic(cls, level_db: float = 78.0, slope_db: float = 0.0) -> Ambient:
+        """Stationary isotropic sea noise alone: every other component switched off."""
+        off = -np.inf
+        return cls(
+            level_db, slope_db, 0.0, off, 0.22, 0.0, 90.0, 20.0, 1 / 3, 0.0, off, off, off
+        )  # fmt: skip
+
+    @classmethod
+    def random(cls, generator: np.random.Generator, quiet: bool = False) -> Ambient:
+        """Draw a background: 74–86 dB at 15 Hz, up to 70 % of it directional, any microseism."""
+        fraction = float(generator.beta(1.0, 3.0)) * 0.9
+        return cls(
+            level_db=float(generator.uniform(74.0, 78.0 if quiet else 86.0)),
+            slope_db=float(generator.uniform(10.0, 28.0)),
+            level_spread_db=float(generator.uniform(0.3, 2.0)),
+            microseism_db=float(generator.uniform(138.0, 154.0)),
+            microseism_hz=float(generator.uniform(0.14, 0.35)),
+            directional_fraction=fraction,
+            directional_azimuth_deg=float(generator.uniform(0.0, 360.0)),
+            directional_elevation_deg=float(generator.uniform(5.0, 40.0)),
+            vertical_coherence=float(generator.uniform(0.1, 0.6)),
+            seismometer_noise_db=float(generator.uniform(-172.0, -150.0)),
+            tilt_noise_db=float(generator.uniform(-140.0, -110.0)),
+        )
+
+    def sea_psd(self, frequency: np.ndarray) -> np.ndarray:
+        """One-sided PSD of the sea noise's pressure [Pa²/Hz], levelling off below 2 Hz."""
+        hertz = np.maximum(frequency, 2.0)
+        return _power(self.level_db - 120.0) * (hertz / REFERENCE_HZ) ** (-self.slope_db / 10)
+
+    def microseism_psd(self, frequency: np.ndarray) -> np.ndarray:
+        """One-sided PSD of the microseism's pressure [Pa²/Hz]: f⁸ below its peak, f⁻⁵ above."""
+        x = np.maximum(frequency, 1e-3) / self.microseism_hz
+        return _power(self.microseism_db - 120.0) * 1.6 / (x**-8 * 0.6 + x**5)
+
+    def pressure_psd(self, frequency: np.ndarray) -> np.ndarray:
+        """One-sided PSD of the whole background's pressure [Pa²/Hz], the hydrophone's own noise included."""
+        own = _power(self.hydrophone_noise_db - 120.0) * np.maximum(1.0, 10.0 / np.maximum(frequency, 1e-2))
+        return self.sea_psd(frequency) + self.microseism_psd(frequency) + own
+
+
+def add_ambient(field: Field, first: int, sampling_rate: float, ambient: Ambient, seed: int) -> None:
+    """Add the background to `field`, whose samples begin at `first` since 1970."""
+
+    def colour(frequency: np.ndarray, z: np.ndarray) -> np.ndarray:
+        gains = _Gains(ambient, frequency, sampling_rate)
+        directional = gains.directional * z[4]
+        east, north, down = gains.direction
+        pressure = gains.isotropic * z[0]
+        return np.stack(
+            (
+                pressure + gains.hydrophone * z[5] + directional,
+                gains.horizontal * z[1] + directional * east,
+                gains.horizontal * z[2] + directional * north,
+                gains.vertical * z[3] + gains.coupled * z[0] + directional * down,
+            )
+        )
+
+    noise = gaussian_noise((seed, 11), first, field.pressure.size, sampling_rate, colour, draws=6)
+    gain = _level(ambient, seed, first, field.pressure.size, sampling_rate)
+    for values, row in zip((field.pressure, field.east, field.north, field.down), noise, strict=True):
+        values += row * gain
+
+
+class _Gains:
+    """Spectral amplitudes [unit/√Hz], float32, of each part of the background."""
+
+    def __init__(self, ambient: Ambient, frequency: np.ndarray, sampling_rate: float) -> None:
+        edge = below_nyquist(frequency, sampling_rate)
+        sea = ambient.sea_psd(frequency)
+        directional = ambient.directional_fraction * sea
+        isotropic = sea - directional + ambient.microseism_psd(frequency)
+        velocity = isotropic / IMPEDANCE**2
+        hertz = np.maximum(frequency, 1e-2)
+        own = _power(ambient.seismometer_noise_db) / (2 * np.pi * hertz) ** 2
+        tilt = _power(ambient.tilt_noise_db) * (hertz / 0.1) ** -3.0 / (2 * np.pi * hertz) ** 2
+        hydrophone = _power(ambient.hydrophone_noise_db - 120.0) * np.maximum(1.0, 10.0 / hertz)
+        coherence = ambient.vertical_coherence
+        self.isotropic = _amplitude(isotropic, edge)
+        self.hydrophone = _amplitude(hydrophone, edge)
+        self.horizontal = _amplitude(ambient.horizontal_share * velocity + own + tilt, edge)
+        self.vertical = _amplitude((1 - coherence**2) * velocity / 3 + own, edge)
+        self.coupled = _amplitude(coherence**2 * velocity / 3, edge)
+        self.directional = _amplitude(directional, edge)
+        self.direction = _direction(ambient)
+
+
+def _direction(ambient: Ambient) -> tuple[np.float32, np.float32, np.float32]:
+    """Velocity east, north, down over pressure of a plane wave from the directional azimuth."""
+    azimuth, elevation = np.deg2rad([ambient.directional_azimuth_deg, ambient.directional_elevation_deg])
+    horizontal = -np.cos(elevation) / IMPEDANCE
+    return (
+        np.float32(horizontal * np.sin(azimuth)),
+        np.float32(horizontal * np.cos(azimuth)),
+        np.float32(np.sin(elevation) / IMPEDANCE),
+    )
+
+
+def _level(ambient: Ambient, seed: int, first: int, count: int, sampling_rate: float) -> np.ndarray:
+    wander = Wander(np.random.default_rng([seed, 12]), ambient.level_spread_db, 1800.0, 24 * 3600.0)
+    samples = np.arange(first, first + count)
+    step = max(round(LEVEL_KNOT_S * sampling_rate), 1)
+    knots = np.arange(first // step, (first + count) // step + 2) * step
+    return np.interp(samples, knots, 10 ** (wander(knots / sampling_rate) / 20))
+
+
+def _power(level_db: float) -> float:
+    return float(10 ** (level_db / 10))
+
+
+def _amplitude(psd: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    return (np.sqrt(psd) * edge).astype(np.float32)
