@@ -1,0 +1,133 @@
+"""Strength of each path pair's interference against range: skew normals of the cepstrum's envelope."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from obsnet.errors import ConfigError
+from obsnet.ocean.rays import parse_pair
+
+TABLE_II_DEPTH_M = 4340.0
+
+
+@dataclass(frozen=True)
+class SkewNormal:
+    """Curve a(r) = k/ω · 2φ(x) Φ(αx), x = (r − ξ)/ω (paper's appendix D, eq. D1).
+
+    Parameters
+    ----------
+    k : area under the curve, m (cepstral amplitude times range).
+    alpha : shape; positive leans towards larger ranges.
+    xi_m, omega_m : location and scale, m.
+    """
+
+    k: float
+    alpha: float
+    xi_m: float
+    omega_m: float
+
+    def __post_init__(self) -> None:
+        values = (self.k, self.alpha, self.xi_m, self.omega_m)
+        if not np.all(np.isfinite(values)) or self.omega_m <= 0 or self.k < 0:
+            raise ConfigError(f"a skew normal needs finite parameters, k >= 0 and omega_m > 0, found {self}")
+
+    def evaluate(self, range_m: np.ndarray) -> np.ndarray:
+        """Cepstral amplitude at ranges [m]."""
+        x = (np.asarray(range_m, float) - self.xi_m) / self.omega_m
+        return 2.0 * self.k / self.omega_m * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) * ndtr(self.alpha * x)
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """Cepstral amplitude of each path pair against range, and the station depth that it holds for.
+
+    >>> peak = Amplitudes.table_ii().evaluate("1-3", np.arange(0.0, 50e3, 70.0)).max()
+    >>> round(float(peak), 3)
+    0.083
+    """
+
+    curves: Mapping[str, SkewNormal]
+    depth_m: float = TABLE_II_DEPTH_M
+
+    def __post_init__(self) -> None:
+        for pair in self.curves:
+            parse_pair(pair)
+        if not self.curves:
+            raise ConfigError("amplitudes need one path pair at least, found none")
+        if not self.depth_m > 0:
+            raise ConfigError(f"depth_m of amplitudes must be > 0, found {self.depth_m}")
+        object.__setattr__(self, "curves", MappingProxyType(dict(self.curves)))
+
+    @classmethod
+    def table_ii(cls) -> Amplitudes:
+        """Amplitudes at station RR03, 4340 m deep (paper's Table II)."""
+        curves = {
+            "1-3": SkewNormal(8.9e2, 4.0, 8.0e3, 7.5e3),
+            "3-5": SkewNormal(1.6e3, 6.0, 14.0e3, 20.0e3),
+            "5-7": SkewNormal(1.0e3, 4.0, 27.0e3, 20.0e3),
+        }
+        return cls(curves)
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """The path pairs, as given."""
+        return tuple(self.curves)
+
+    def evaluate(self, pair: str, range_m: np.ndarray) -> np.ndarray:
+        """Cepstral amplitude of a pair at ranges [m].
+
+        Raises
+        ------
+        ConfigError
+            The pair is not among these amplitudes.
+        """
+        if pair not in self.curves:
+            raise ConfigError(f"no amplitude for path pair {pair!r}; there are {', '.join(self.curves)}")
+        return self.curves[pair].evaluate(range_m)
+
+    def scaled_to(self, depth_m: float) -> Amplitudes:
+        """Amplitudes at another depth of station: a pair's visibility goes with range over depth."""
+        if not (np.isfinite(depth_m) and depth_m > 0):
+            raise ConfigError(f"the station's depth must be > 0 m, found {depth_m}")
+        s = depth_m / self.depth_m
+        scaled = {
+            pair: SkewNormal(curve.k * s, curve.alpha, curve.xi_m * s, curve.omega_m * s)
+            for pair, curve in self.curves.items()
+        }
+        return Amplitudes(scaled, depth_m)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain mapping, ready for YAML or JSON."""
+        curves = {
+            pair: {"k": c.k, "alpha": c.alpha, "xi_m": c.xi_m, "omega_m": c.omega_m}
+            for pair, c in self.curves.items()
+        }
+        return {"depth_m": self.depth_m, "pairs": curves}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Amplitudes:
+        """Inverse of `to_dict`.
+
+        Raises
+        ------
+        ConfigError
+            A key is missing or a value is not a number.
+        """
+        try:
+            curves = {
+                str(pair): SkewNormal(**{key: float(value) for key, value in curve.items()})
+                for pair, curve in values["pairs"].items()
+            }
+            return cls(curves, float(values["depth_m"]))
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(
+                f"amplitudes need depth_m and pairs, each with k, alpha, xi_m, omega_m; found {values!r}"
+            ) from None
