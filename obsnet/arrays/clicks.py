@@ -1,0 +1,255 @@
+"""Clicks on a compact array: a multichannel recording in, clicks with their angle of arrival, range and
+azimuth map out.
+
+Energy detector and coincidence (`click_detector`), TDOAs by cross-correlation (`tdoa`), angle of arrival
+(`arrival`), range from the surface echo (`echo`), azimuth map (`click_map`): `process` runs them one after
+the other. A tracker for several animals and clutter is `obsnet.trackers.association`.
+
+Source: Bénard-Caudal, Giraudet & Glotin 2010, Appl. Acoust. 71.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy.signal.windows import tukey
+
+from obsnet.arrays.arrival import Directions, directions
+from obsnet.arrays.click_detector import Arrival, DetectorConfig, arrivals, coincidences
+from obsnet.arrays.click_map import ClickMapConfig, azimuth_map
+from obsnet.arrays.compact import CompactArray
+from obsnet.arrays.echo import EchoRanges, echo_range, surface_echoes
+from obsnet.arrays.recording import Recording, read_wav
+from obsnet.arrays.tdoa import Interpolation, cross_correlation_tdoa, tdoa_variance
+from obsnet.errors import ConfigError, WaveformError
+
+__all__ = [
+    "ClickConfig",
+    "ClickMapConfig",
+    "ClickRecord",
+    "CompactArray",
+    "DetectorConfig",
+    "azimuth_map",
+    "echo_range",
+    "process",
+    "read_wav",
+]
+
+
+@dataclass(frozen=True)
+class ClickConfig:
+    """From a recording to clicks with their angles of arrival.
+
+    Attributes
+    ----------
+    detector : DetectorConfig
+    channels : channels of the recording, counted from 1, in the order of the array's hydrophones; all by
+        default.
+    click_s : length of the stretch around a click that is correlated, s.
+    interpolation : of the correlation's peak: none, parabolic or upsampled.
+    every_pair : correlate all pairs, not only those with the first hydrophone (the paper's).
+    timing_std_s : error of arrival times besides noise (synchronisation of the channels), s.
+    false_rejection : share of right clicks that the χ² gate may refuse.
+    echoes : look for surface echoes.
+    max_range_m : beyond this no echo is believed, m.
+    """
+
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    channels: tuple[int, ...] | None = None
+    click_s: float = 0.010
+    interpolation: Interpolation = "upsampled"
+    every_pair: bool = True
+    timing_std_s: float = 1e-6
+    false_rejection: float = 0.01
+    echoes: bool = True
+    max_range_m: float = 20_000.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.click_s) and self.click_s > 0):
+            raise ConfigError(f"click_s must be positive, found {self.click_s!r}")
+        if not self.timing_std_s >= 0:
+            raise ConfigError(f"timing_std_s must be at least 0, found {self.timing_std_s!r}")
+        if not 0.0 < self.false_rejection < 1.0:
+            raise ConfigError(f"false_rejection must lie between 0 and 1, found {self.false_rejection!r}")
+        if not self.max_range_m > 0:
+            raise ConfigError(f"max_range_m must be positive, found {self.max_range_m!r}")
+
+
+@dataclass(frozen=True)
+class ClickRecord:
+    """Clicks of one recording, in the order of time.
+
+    Attributes
+    ----------
+    array : CompactArray; pairs : int array (pair, 2), hydrophones counted from 0.
+    start, end : of the recording, s since 1970.
+    time : array (click,), arrival at the array's centre, s since 1970.
+    tdoa, coefficient : arrays (click, pair), t_i − t_j in s and correlation coefficient.
+    tdoa_covariance : array (click, pair, pair), s².
+    snr_db : array (click,), best hydrophone's.
+    directions : Directions, with the χ² gate's verdict.
+    echoes : EchoRanges, of the accepted clicks.
+    """
+
+    array: CompactArray
+    pairs: np.ndarray
+    start: float
+    end: float
+    time: np.ndarray
+    tdoa: np.ndarray
+    coefficient: np.ndarray
+    tdoa_covariance: np.ndarray
+    snr_db: np.ndarray
+    directions: Directions
+    echoes: EchoRanges
+
+    @property
+    def direct(self) -> np.ndarray:
+        """Clicks that passed the gate and are no surface echo, bool array (click,)."""
+        return self.directions.accepted & (self.echoes.echo_of < 0)
+
+    def frame(self) -> pd.DataFrame:
+        """One row a click: time [s since 1970], angles and their standard deviations, gate, echo, range."""
+        spread = np.sqrt(np.diagonal(self.directions.covariance, axis1=1, axis2=2))
+        columns = {
+            "time": self.time,
+            "azimuth_deg": self.directions.azimuth_deg,
+            "elevation_deg": self.directions.elevation_deg,
+            "azimuth_std_deg": spread[:, 0],
+            "elevation_std_deg": spread[:, 1],
+            "chi_squared": self.directions.chi_squared,
+            "accepted": self.directions.accepted,
+            "correlation": np.median(self.coefficient, axis=1) if len(self.time) else self.time,
+            "snr_db": self.snr_db,
+            "echo_of": self.echoes.echo_of,
+            "echo_delay_s": self.echoes.delay_s,
+            "range_m": self.echoes.range_m,
+            "range_std_m": self.echoes.range_std_m,
+            "depth_m": self.echoes.depth_m,
+        }
+        return pd.DataFrame(columns)
+
+    def azimuth_map(
+        self, times: np.ndarray, azimuth: np.ndarray | None = None, config: ClickMapConfig | None = None
+    ) -> xr.Dataset:
+        """Azimuth map of the direct clicks, see `click_map.azimuth_map`."""
+        return azimuth_map(self.frame()[self.direct], times, azimuth, config, (self.start, self.end))
+
+
+def process(
+    wav: str | Path | tuple[float, np.ndarray],
+    geometry: CompactArray,
+    config: ClickConfig | None = None,
+    starttime: float = 0.0,
+) -> ClickRecord:
+    """Detect the clicks of a recording and find where each came from.
+
+    Parameters
+    ----------
+    wav : path of a multichannel WAV file, or (sampling rate [Hz], samples (hydrophone, time)).
+    geometry : CompactArray, one hydrophone a channel.
+    starttime : time of the first sample, s since 1970.
+
+    Raises
+    ------
+    WaveformError
+        The file cannot be read, or has another number of channels than the array has hydrophones.
+    ConfigError
+        A parameter does not fit the recording's sampling rate.
+    """
+    config = config or ClickConfig()
+    recording = Recording.of(wav)
+    if config.channels is not None:
+        recording = recording.select(config.channels)
+    if recording.count != geometry.count:
+        raise WaveformError(
+            f"{recording.name} has {recording.count} channels and the array {geometry.count} hydrophones; "
+            "name the array's channels in the configuration or give the right geometry"
+        )
+    detector = config.detector
+    within = max(detector.coincidence_s, 1.2 * geometry.aperture_s + 0.002)
+    least = (
+        geometry.count if detector.min_hydrophones is None else min(detector.min_hydrophones, geometry.count)
+    )
+    groups = coincidences(arrivals(recording, detector), within, least)
+    pairs = geometry.pairs(config.every_pair)
+    timed = [_timed(recording, geometry, pairs, group, config) for group in groups]
+    timed = sorted((click for click in timed if click is not None), key=lambda click: click[0])
+    time = np.array([click[0] for click in timed])
+    tdoa = np.array([click[1] for click in timed]).reshape(-1, len(pairs))
+    coefficient = np.array([click[2] for click in timed]).reshape(-1, len(pairs))
+    covariance = np.array([click[3] for click in timed]).reshape(-1, len(pairs), len(pairs))
+    found = directions(tdoa, geometry, pairs, covariance, config.false_rejection)
+    return ClickRecord(
+        array=geometry,
+        pairs=pairs,
+        start=starttime,
+        end=starttime + recording.duration_s,
+        time=time + starttime,
+        tdoa=tdoa,
+        coefficient=coefficient,
+        tdoa_covariance=covariance,
+        snr_db=np.array([click[4] for click in timed]),
+        directions=found,
+        echoes=_echoes(time, found, geometry, config),
+    )
+
+
+def _timed(
+    recording: Recording, array: CompactArray, pairs: np.ndarray, group: list[Arrival], config: ClickConfig
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, float] | None:
+    """Time, TDOAs, correlation coefficients, covariance and SNR of one click; None where it cannot be
+    correlated.
+    """
+    rate = recording.sampling_rate
+    time = float(np.mean([arrival.time for arrival in group]))
+    reach = np.asarray(array.travel(pairs))
+    half = int(np.ceil((config.click_s / 2.0 + reach.max()) * rate))
+    centre = round(time * rate)
+    segments = recording.segment(centre - half, centre + half + 1)
+    segments = segments * tukey(segments.shape[1], 0.2)
+    bands = _bands(group, config.detector.octaves(rate))
+    tdoa, coefficient = cross_correlation_tdoa(
+        segments, rate, pairs, reach * 1.02 + 1.0 / rate, bands, config.interpolation
+    )
+    if not np.isfinite(tdoa).any():
+        return None
+    shared, own = tdoa_variance(coefficient, segments.shape[1] / rate, bands)
+    own += ((1.0 / np.sqrt(12.0) if config.interpolation == "none" else 0.05) / rate) ** 2
+    covariance = array.tdoa_covariance(pairs, np.sqrt(shared + config.timing_std_s**2), np.sqrt(own))
+    return time, tdoa, coefficient, covariance, max(arrival.snr_db for arrival in group)
+
+
+def _bands(group: list[Arrival], octaves: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Octaves that exceeded on most of the hydrophones, or on any where none did on most."""
+    votes = np.array([sum(k in arrival.octaves for arrival in group) for k in range(len(octaves))])
+    chosen = votes > len(group) / 2.0
+    if not chosen.any():
+        chosen = votes > 0
+    return [octave for octave, keep in zip(octaves, chosen, strict=True) if keep]
+
+
+def _echoes(time: np.ndarray, found: Directions, array: CompactArray, config: ClickConfig) -> EchoRanges:
+    """Surface echoes among the accepted clicks, over all clicks."""
+    blank = [np.full(len(time), np.nan) for _ in range(4)]
+    nothing = EchoRanges(*blank, echo_of=np.full(len(time), -1))
+    chosen = np.flatnonzero(found.accepted)
+    if not config.echoes or array.mean_depth_m <= 0 or not len(chosen):
+        return nothing
+    ranged = surface_echoes(
+        time[chosen],
+        found.azimuth_deg[chosen],
+        found.elevation_deg[chosen],
+        found.covariance[chosen],
+        array.mean_depth_m,
+        array.sound_speed_mps,
+        max_range_m=config.max_range_m,
+    )
+    for name in ("delay_s", "range_m", "range_std_m", "depth_m"):
+        getattr(nothing, name)[chosen] = getattr(ranged, name)
+    nothing.echo_of[chosen] = np.where(ranged.echo_of >= 0, chosen[ranged.echo_of], -1)
+    return nothing
