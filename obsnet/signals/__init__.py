@@ -1,0 +1,1 @@
+"""Waveforms in, representations out: spectra in physical units, azigram, cepstrogram."""

@@ -1,0 +1,442 @@
+"""StationXML in, `Station` out: position, depth, and for every channel its direction, polarity and response.
+
+Which channels are used. A motion channel has a motion instrument code and any orientation code; a pressure channel has
+instrument code D or orientation code H. Among the channels at hand (`Station.at`), the motion group (one location, band
+and instrument) with the most components wins, then the lowest sampling rate, then the lowest location code; the pressure
+channel is taken from the same location and band where there is one, hydrophones (H) before gauges (G), else the nearest.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from obsnet.errors import StationError
+from obsnet.layout import iso
+
+_MOTION_INSTRUMENTS = "HLNGPM"
+_PAIRS = ("NE", "12", "XY", "23", "13", "TR", "UV", "AB")
+_PRESSURE_ORDER = "HFG"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One epoch of one channel.
+
+    Attributes
+    ----------
+    seed_id : str
+        NET.STA.LOC.CHA.
+    kind : {"pressure", "motion"}
+        Pascal, or metre a second.
+    azimuth_deg : float or None
+        Direction of positive motion, clockwise from North; None where the metadata do not say.
+    dip_deg : float
+        Degrees below the horizontal (SEED): -90 is up, +90 down. Meaningless for pressure.
+    polarity : int
+        -1 for a pressure channel that is known to be reversed against its response.
+    response : obspy Response or None
+        None: the samples are taken as Pa or m/s already.
+    sampling_rate : float
+        Hz as the metadata have it; 0 where they do not say. The waveforms decide.
+    starttime, endtime : float
+        Epoch, seconds since 1970.
+    """
+
+    seed_id: str
+    kind: Literal["pressure", "motion"]
+    azimuth_deg: float | None = None
+    dip_deg: float = 0.0
+    polarity: int = 1
+    response: Any = field(default=None, compare=False, repr=False)
+    sampling_rate: float = 0.0
+    starttime: float = -math.inf
+    endtime: float = math.inf
+
+    @property
+    def code(self) -> str:
+        """Three-letter channel code."""
+        return self.seed_id.rpartition(".")[2]
+
+    @property
+    def orientation(self) -> str:
+        """Orientation letter, the last of the code."""
+        return self.code[-1:]
+
+    @property
+    def group(self) -> str:
+        """SEED id without the orientation letter: channels of one sensor share it."""
+        return self.seed_id[:-1]
+
+    @property
+    def horizontal(self) -> bool:
+        """Whether it is a motion channel nearer to the horizontal than to the vertical."""
+        return self.kind == "motion" and abs(self.dip_deg) <= 45.0
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Unit vector (east, north, down) of positive motion."""
+        azimuth, dip = math.radians(self.azimuth_deg or 0.0), math.radians(self.dip_deg)
+        flat = math.cos(dip)
+        return np.array([flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(dip)])
+
+    def covers(self, time: float) -> bool:
+        """Whether `time` (s since 1970) lies in the epoch."""
+        return self.starttime <= time < self.endtime
+
+
+@dataclass(frozen=True)
+class Station:
+    """An ocean-bottom station.
+
+    Attributes
+    ----------
+    code : str
+        "NET.STA".
+    latitude, longitude : float
+        Degrees, WGS 84.
+    depth_m : float
+        Depth of the sea floor below the surface, positive.
+    channels : tuple of Channel
+        The channels in use: at most one pressure channel and one motion sensor (the module says how they are chosen).
+    epochs : tuple of Channel
+        Every usable channel of every epoch, location and band; what `at` chooses from.
+
+    Examples
+    --------
+    >>> station = Station("YV.RR03", -21.4, 54.2, 4340.0, (Channel("YV.RR03.00.BDH", "pressure"),))
+    >>> station.pressure.code
+    'BDH'
+    """
+
+    code: str
+    latitude: float
+    longitude: float
+    depth_m: float
+    channels: tuple[Channel, ...] = ()
+    epochs: tuple[Channel, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        if not (-90 <= self.latitude <= 90 and -180 <= self.longitude <= 360):
+            raise StationError(
+                f"{self.code} lies at latitude {self.latitude}, longitude {self.longitude}; correct its position"
+            )
+        if not (math.isfinite(self.depth_m) and 0 < self.depth_m < 12000):
+            raise StationError(
+                f"the depth of {self.code} would be {self.depth_m:g} m (minus its elevation); give its depth (--depth)"
+            )
+        if not self.epochs:
+            object.__setattr__(self, "epochs", self.channels)
+
+    @classmethod
+    def from_stationxml(
+        cls,
+        source: Any,
+        code: str | None = None,
+        *,
+        time: Any = None,
+        orientation_deg: float | None = None,
+        hydrophone_polarity: int | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        depth_m: float | None = None,
+    ) -> Station:
+        """Read a station from StationXML.
+
+        Parameters
+        ----------
+        source : path or obspy Inventory
+            Where the station is described.
+        code : str, optional
+            "NET.STA" (or "STA" where that is unique); may be left out if there is only one station.
+        time : datetime64, ISO text or UTCDateTime, optional
+            Keep only the epochs in force at this time. By default all are kept and the waveforms' times decide.
+        orientation_deg : float, optional
+            Azimuth of the first horizontal (N, 1, X, else the lower code), overriding the metadata. The others keep their angle
+            to it; where the metadata give none, the second is 90° clockwise of the first.
+        hydrophone_polarity : {1, -1}, optional
+            -1 if a compression makes the hydrophone, corrected for its response, go down.
+        latitude, longitude, depth_m : float, optional
+            Override the position [deg] and the depth [m].
+
+        Raises
+        ------
+        StationError
+            Unreadable metadata, another station, no usable channel, no epoch at `time`, no depth.
+
+        Notes
+        -----
+        The polarity of a pressure channel is the sign of its response; its dip is not used, since instrument parks disagree
+        on what it means.
+        """
+        inventory = _read(source)
+        station, network, name = _find(
+            inventory, code, "the inventory" if not isinstance(source, (str, Path)) else str(source)
+        )
+        full = f"{network}.{name}"
+        epochs = tuple(channel for item in station for channel in _channels(item, full))
+        if not epochs:
+            raise StationError(
+                f"{full} has no hydrophone and no motion channel in {_describe(source)}; check its channel codes"
+            )
+        if time is not None:
+            epochs = _in_force(epochs, time, full)
+        last = station[-1]
+        made = cls(
+            full,
+            float(last.latitude if latitude is None else latitude),
+            float(last.longitude if longitude is None else longitude),
+            _depth(last, full) if depth_m is None else float(depth_m),
+            epochs=epochs,
+        )
+        return made.calibrated(orientation_deg=orientation_deg, hydrophone_polarity=hydrophone_polarity).at()
+
+    @property
+    def pressure(self) -> Channel | None:
+        """The hydrophone or pressure gauge in use."""
+        return next((channel for channel in self.channels if channel.kind == "pressure"), None)
+
+    @property
+    def motion(self) -> tuple[Channel, ...]:
+        """The motion channels in use."""
+        return tuple(channel for channel in self.channels if channel.kind == "motion")
+
+    @property
+    def horizontals(self) -> tuple[Channel, ...]:
+        """The horizontals in use, the first one first."""
+        return tuple(sorted((c for c in self.channels if c.horizontal), key=_horizontal_order))
+
+    @property
+    def orientation_deg(self) -> float | None:
+        """Azimuth of the first horizontal, or None where there is none or it is unknown."""
+        return self.horizontals[0].azimuth_deg if self.horizontals else None
+
+    def at(self, time: float | None = None, seed_ids: Collection[str] | None = None) -> Station:
+        """The station with the channels that serve at a time.
+
+        Parameters
+        ----------
+        time : float, optional
+            Seconds since 1970; by default each channel's latest epoch.
+        seed_ids : collection of str, optional
+            Choose among these channels only (those that have waveforms).
+        """
+        pool: dict[str, Channel] = {}
+        for channel in sorted(self.epochs, key=lambda c: c.starttime):
+            wanted = seed_ids is None or channel.seed_id in seed_ids
+            if wanted and (time is None or channel.covers(time)):
+                pool[channel.seed_id] = channel
+        motion = _choose_motion([c for c in pool.values() if c.kind == "motion"])
+        pressure = _choose_pressure([c for c in pool.values() if c.kind == "pressure"], motion)
+        return replace(self, channels=(*pressure, *motion))
+
+    def calibrated(
+        self,
+        *,
+        orientation_deg: float | None = None,
+        hydrophone_polarity: int | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        depth_m: float | None = None,
+    ) -> Station:
+        """The station with metadata overridden; arguments as in `from_stationxml`."""
+        if hydrophone_polarity not in (None, 1, -1):
+            raise StationError(f"the hydrophone's polarity must be 1 or -1, found {hydrophone_polarity}")
+        if orientation_deg is not None and not math.isfinite(orientation_deg):
+            raise StationError(f"the orientation must be an azimuth in degrees, found {orientation_deg}")
+        epochs = self.epochs
+        if orientation_deg is not None:
+            epochs = tuple(_turned(channel, epochs, orientation_deg) for channel in epochs)
+        if hydrophone_polarity is not None:
+            epochs = tuple(
+                replace(c, polarity=hydrophone_polarity) if c.kind == "pressure" else c for c in epochs
+            )
+        chosen = {(c.seed_id, c.starttime) for c in self.channels}
+        return replace(
+            self,
+            latitude=self.latitude if latitude is None else float(latitude),
+            longitude=self.longitude if longitude is None else float(longitude),
+            depth_m=self.depth_m if depth_m is None else float(depth_m),
+            channels=tuple(c for c in epochs if (c.seed_id, c.starttime) in chosen),
+            epochs=epochs,
+        )
+
+
+def _describe(source: Any) -> str:
+    return str(source) if isinstance(source, (str, Path)) else "the inventory"
+
+
+def _read(source: Any) -> Any:
+    """Parse StationXML without entities, networks or half-read files."""
+    if not isinstance(source, (str, Path)):
+        if hasattr(source, "networks"):
+            return source
+        raise StationError(
+            f"a station needs a StationXML path or an obspy Inventory, found a {type(source).__name__}"
+        )
+    from io import BytesIO
+
+    import obspy
+
+    try:
+        content = Path(source).read_bytes()
+    except OSError as error:
+        raise StationError(f"cannot read the StationXML {source}: {error.strerror}") from None
+    if not content.strip():
+        raise StationError(f"the StationXML {source} is empty")
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise StationError(
+            f"the StationXML {source} declares entities, which StationXML has no use for; remove them"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return obspy.read_inventory(BytesIO(content), format="STATIONXML")
+        except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
+            detail = " ".join(str(error).split())[:120] or type(error).__name__
+            raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None
+
+
+def _find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, str]:
+    """All epochs (in order of start) of the one station asked for."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for network in inventory.networks:
+        for station in network.stations:
+            found.setdefault((network.code, station.code), []).append(station)
+    names = ", ".join(f"{net}.{sta}" for net, sta in found) or "none"
+    if len(names) > 200:
+        names = names[:200].rpartition(",")[0] + ", …"
+    wanted = [key for key in found if code is None or code in (key[1], ".".join(key))]
+    if not wanted:
+        raise StationError(
+            f"{where} does not describe {code}; it has {names}" if found else f"{where} describes no station"
+        )
+    if len(wanted) > 1:
+        raise StationError(f"{where} describes {len(found)} stations; name one of {names}")
+    network, name = wanted[0]
+    return sorted(found[wanted[0]], key=lambda item: _seconds(item.start_date, -math.inf)), network, name
+
+
+def _channels(station: Any, full: str) -> list[Channel]:
+    made = []
+    for item in station.channels:
+        code = item.code
+        if len(code) != 3:
+            continue
+        pressure = code[1] == "D" or code[2] == "H"
+        if not pressure and code[1] not in _MOTION_INSTRUMENTS:
+            continue
+        dip = item.dip if item.dip is not None else (-90.0 if code[2] == "Z" else 0.0)
+        made.append(
+            Channel(
+                f"{full}.{item.location_code or ''}.{code}",
+                "pressure" if pressure else "motion",
+                None if item.azimuth is None else float(item.azimuth) % 360.0,
+                float(dip),
+                1,
+                item.response,
+                float(item.sample_rate or 0.0),
+                _seconds(item.start_date, -math.inf),
+                _seconds(item.end_date, math.inf),
+            )
+        )
+    return made
+
+
+def _in_force(epochs: tuple[Channel, ...], time: Any, full: str) -> tuple[Channel, ...]:
+    stamp = _seconds(time, 0.0)
+    kept = tuple(channel for channel in epochs if channel.covers(stamp))
+    if not kept:
+        begin, end = min(c.starttime for c in epochs), max(c.endtime for c in epochs)
+        span = " to ".join(iso(edge) if math.isfinite(edge) else "now" for edge in (begin, end))
+        raise StationError(f"no channel of {full} has an epoch at {iso(stamp)}; its epochs span {span}")
+    return kept
+
+
+def _depth(station: Any, full: str) -> float:
+    elevation = station.elevation
+    if elevation is None:
+        raise StationError(f"{full} has no elevation in its StationXML; give its depth (--depth)")
+    if float(elevation) >= 0:
+        raise StationError(
+            f"{full} has an elevation of {float(elevation):g} m, but the sea floor lies below 0; give its depth (--depth)"
+        )
+    return -float(elevation)
+
+
+def _choose_motion(channels: list[Channel]) -> tuple[Channel, ...]:
+    groups: dict[str, list[Channel]] = {}
+    for channel in channels:
+        groups.setdefault(channel.group, []).append(channel)
+    if not groups:
+        return ()
+    chosen = [_three(group) for group in groups.values()]
+    return min(chosen, key=lambda g: (-len(g), g[0].sampling_rate or math.inf, g[0].group))
+
+
+def _three(group: list[Channel]) -> tuple[Channel, ...]:
+    """At most three components: the vertical and one pair of horizontals."""
+    flat = sorted((c for c in group if c.horizontal), key=_horizontal_order)
+    steep = sorted((c for c in group if not c.horizontal), key=lambda c: c.orientation != "Z")
+    if len(flat) + len(steep) > 3:
+        letters = "".join(c.orientation for c in flat)
+        pair = next((pair for pair in _PAIRS if set(pair) <= set(letters)), letters[:2])
+        flat = [c for c in flat if c.orientation in pair][:2]
+    return (*flat, *steep)[:3]
+
+
+def _choose_pressure(channels: list[Channel], motion: tuple[Channel, ...]) -> tuple[Channel, ...]:
+    if not channels:
+        return ()
+
+    def preference(channel: Channel) -> tuple[Any, ...]:
+        location, band = channel.seed_id.split(".")[2], channel.code[0]
+        beside = motion[0].seed_id.split(".")[2] if motion else location
+        like = motion[0].code[0] if motion else band
+        kind = _PRESSURE_ORDER.find(channel.orientation) % 99
+        return (location != beside, band != like, kind, channel.sampling_rate or math.inf, channel.seed_id)
+
+    return (min(channels, key=preference),)
+
+
+def _horizontal_order(channel: Channel) -> tuple[bool, str]:
+    return (channel.orientation != "N", channel.orientation)
+
+
+def _turned(channel: Channel, epochs: tuple[Channel, ...], orientation_deg: float) -> Channel:
+    """`channel` as its sensor would say had the first horizontal this azimuth."""
+    if not channel.horizontal:
+        return channel
+    beside = [c for c in epochs if c.horizontal and c.group == channel.group and _overlap(c, channel)]
+    first = min(beside, key=_horizontal_order)
+    if first.seed_id == channel.seed_id:
+        relative = 0.0
+    elif first.azimuth_deg is None or channel.azimuth_deg is None or first.azimuth_deg == channel.azimuth_deg:
+        relative = 90.0
+    else:
+        relative = channel.azimuth_deg - first.azimuth_deg
+    return replace(channel, azimuth_deg=(orientation_deg + relative) % 360.0)
+
+
+def _overlap(first: Channel, second: Channel) -> bool:
+    return first.starttime < second.endtime and second.starttime < first.endtime
+
+
+def _seconds(time: Any, default: float) -> float:
+    if time is None:
+        return default
+    if hasattr(time, "timestamp") and not callable(time.timestamp):
+        return float(time.timestamp)
+    try:
+        text = time.rstrip("Z") if isinstance(time, str) else time
+        return float(np.datetime64(text, "ns").astype("int64")) / 1e9
+    except (ValueError, TypeError):
+        raise StationError(
+            f"cannot read the time {time!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
+        ) from None

@@ -1,0 +1,411 @@
+"""Files, folders, an SDS archive or an obspy Stream in, one timeline of samples for each channel of a station out.
+
+Headers are read first and samples only when a block needs them, so that memory stays flat with the length of the record.
+Formats are recognised by obspy, except Python pickles, which could run code and are never opened.
+"""
+
+from __future__ import annotations
+
+import glob
+import re
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import obspy
+from obspy.core.util.base import ENTRY_POINTS
+from obspy.core.util.decorator import uncompress_file
+from obspy.core.util.misc import buffered_load_entry_point
+
+from obsnet.errors import WaveformError
+from obsnet.layout import iso
+from obsnet.signals.records import RecordReader
+from obsnet.signals.station import Station
+from obsnet.signals.timeline import Piece, Timeline
+
+_SECOND = 1_000_000_000
+_DAY_NS = 86400 * _SECOND
+_SDS_FILE = re.compile(r"^([^.]+)\.([^.]+)\.([^.]*)\.([^.]+)\.[A-Z]\.(\d{4})\.(\d{3})$")
+_RATE_TOLERANCE = 1e-3
+_CHECKED_OVERLAPS = 20
+_CHECKED_S = 60.0
+
+
+@dataclass
+class ChannelReport:
+    """What became of one channel; times ISO 8601, durations in s, frames as counted by the spectra."""
+
+    sampling_rate: float
+    starttime: str
+    endtime: str
+    gaps: int = 0
+    gap_s: float = 0.0
+    overlaps: int = 0
+    conflicting_overlaps: int = 0
+    dead_frames: int = 0
+    clipped_frames: int = 0
+
+
+@dataclass
+class WaveformReport:
+    """What was read, what was left aside and why; plain values for `run.json`."""
+
+    files: int = 0
+    ignored: dict[str, str] = field(default_factory=dict)
+    channels: dict[str, ChannelReport] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        """Add a remark once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested plain dictionary."""
+        return asdict(self)
+
+
+class WaveformSource:
+    """The waveforms of one station, channel by channel.
+
+    Attributes
+    ----------
+    station : Station
+    timelines : dict of Timeline
+        By SEED id, for the channels that can serve.
+    begin_ns, end_ns : int
+        The span asked for, cut to what is there; ns since 1970.
+    bounded : bool
+        Whether the caller gave a start or an end.
+    report : WaveformReport
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        timelines: dict[str, Timeline],
+        report: WaveformReport,
+        begin_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> None:
+        self.station, self.timelines, self.report = station, timelines, report
+        first = min(timeline.begin_ns for timeline in timelines.values())
+        last = max(timeline.end_ns for timeline in timelines.values())
+        self.begin_ns = first if begin_ns is None else begin_ns
+        self.end_ns = last if end_ns is None else end_ns
+        self.data_begin_ns, self.data_end_ns = first, last
+        if self.begin_ns >= last or self.end_ns <= first:
+            raise WaveformError(
+                f"{station.code} has no waveforms between {_iso(self.begin_ns)} and {_iso(self.end_ns)}; "
+                f"they span {_iso(first)} to {_iso(last)}"
+            )
+
+    def station_at(self, time_ns: int) -> Station:
+        """The station with the channels that have waveforms and an epoch at a time."""
+        return self.station.at(time_ns / _SECOND, self.timelines.keys())
+
+
+def open_waveforms(
+    source: Any,
+    station: Station,
+    *,
+    starttime: Any = None,
+    endtime: Any = None,
+    min_rate_hz: float = 50.0,
+) -> WaveformSource:
+    """Find a station's waveforms.
+
+    Parameters
+    ----------
+    source : obspy Stream, path, or list of paths
+        Files in any format that obspy reads (pickles excepted), folders (searched to any depth), wildcards, SDS archives.
+    station : Station
+        Whose channels to look for. A file that differs from it in nothing but a location code, or an empty network code,
+        is taken to be the station's, and the report says so.
+    starttime, endtime : optional
+        datetime64, ISO text, UTCDateTime or s since 1970.
+    min_rate_hz : float
+        Channels sampled more slowly cannot serve.
+
+    Returns
+    -------
+    WaveformSource
+
+    Raises
+    ------
+    WaveformError
+        Nothing usable was found; the message says what was.
+    """
+    begin, end = (None if time is None else to_ns(time) for time in (starttime, endtime))
+    if begin is not None and end is not None and begin >= end:
+        raise WaveformError(
+            f"the start {_iso(begin)} is not before the end {_iso(end)}; swap or correct them"
+        )
+    if isinstance(source, WaveformSource):
+        return WaveformSource(source.station, source.timelines, source.report, begin, end)
+    report = WaveformReport()
+    if isinstance(source, (obspy.Stream, obspy.Trace)):
+        what, found = "the stream", _from_stream(source)
+    else:
+        paths = [source] if isinstance(source, (str, Path)) else list(source)
+        what = ", ".join(str(path) for path in paths[:3]) + (", …" if len(paths) > 3 else "")
+        found = _from_files(paths, station, begin, end, report)
+    timelines = _sort(found, station, min_rate_hz, what, report)
+    return WaveformSource(station, timelines, report, begin, end)
+
+
+def to_ns(time: Any) -> int:
+    """Nanoseconds since 1970 of a datetime64, ISO text, UTCDateTime, datetime or number of seconds.
+
+    >>> to_ns("1970-01-01T00:00:10.24Z")
+    10240000000
+    """
+    if isinstance(time, obspy.UTCDateTime):
+        return int(time.ns)
+    if isinstance(time, (int, float)) and not isinstance(time, bool):
+        return round(time * _SECOND)
+    try:
+        stamp = np.datetime64(time.rstrip("Z") if isinstance(time, str) else time, "ns")
+        if np.isnat(stamp):
+            raise ValueError
+        return int(stamp.astype(np.int64))
+    except (ValueError, TypeError):
+        raise WaveformError(
+            f"cannot read the time {time!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
+        ) from None
+
+
+def _iso(time_ns: int) -> str:
+    return iso(np.datetime64(time_ns, "ns"))
+
+
+def _from_stream(stream: Any) -> Iterator[tuple[str, Piece]]:
+    traces = [stream] if isinstance(stream, obspy.Trace) else list(stream)
+    for trace in traces:
+        parts = trace.split() if isinstance(trace.data, np.ma.MaskedArray) else [trace]
+        for part in parts:
+            if part.stats.npts and part.data.dtype.kind in "iuf":
+                data = np.ma.getdata(part.data)
+                yield part.id, _trace_piece(part, partial(_slice, data))
+
+
+def _slice(data: np.ndarray, first: int, last: int) -> np.ndarray:
+    return data[first:last]
+
+
+def _trace_piece(trace: Any, read: Any) -> Piece:
+    return Piece(read, int(trace.stats.starttime.ns), int(trace.stats.npts), float(trace.stats.sampling_rate))
+
+
+def _from_files(
+    paths: list[Any], station: Station, begin: int | None, end: int | None, report: WaveformReport
+) -> Iterator[tuple[str, Piece]]:
+    records, others = RecordReader(), _FileReader()
+    for path in _list_files(paths, station, begin, end):
+        report.files += 1
+        try:
+            if path.stat().st_size == 0:
+                report.ignored[str(path)] = "empty"
+                continue
+            scanned = records.pieces(path)
+            if scanned is None:
+                yield from others.pieces(path)
+                continue
+        except (OSError, WaveformError) as error:
+            report.ignored[str(path)] = getattr(error, "strerror", None) or str(error)
+            continue
+        pieces, file = scanned
+        if file.broken:
+            report.note(f"{path.name}: {file.broken} records are cut or unreadable")
+        repeats = sum(channel.repeats for channel in file.channels)
+        if repeats:
+            report.note(f"{path.name}: {repeats} records are repeated; used once")
+        yield from pieces
+
+
+def _list_files(paths: list[Any], station: Station, begin: int | None, end: int | None) -> Iterator[Path]:
+    """Every file once, in order; in an SDS archive only the station's days."""
+    seen: set[Path] = set()
+    for item in paths:
+        path = Path(item)
+        if path.is_dir():
+            found: Iterable[Path] = _list_folder(path, station, begin, end)
+        elif path.exists():
+            found = [path]
+        else:
+            found = [
+                Path(match) for match in sorted(glob.glob(str(item), recursive=True)) if Path(match).is_file()
+            ]
+            if not found:
+                raise WaveformError(f"there is no file, folder or archive {item}; check the path")
+        for file in found:
+            key = file.resolve()
+            if key not in seen:
+                seen.add(key)
+                yield file
+
+
+def _list_folder(folder: Path, station: Station, begin: int | None, end: int | None) -> Iterator[Path]:
+    network, _, name = station.code.partition(".")
+    years = [sub for sub in sorted(folder.iterdir()) if sub.is_dir() and re.fullmatch(r"\d{4}", sub.name)]
+    own = [year / network / name for year in years if (year / network / name).is_dir()]
+    for root in own or [folder]:
+        for file in sorted(root.rglob("*")):
+            hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+            if file.is_file() and not hidden and _day_overlaps(file.name, begin, end):
+                yield file
+
+
+def _day_overlaps(name: str, begin: int | None, end: int | None) -> bool:
+    """Whether a file named as in an SDS archive can hold samples of the span; records may reach a little over midnight."""
+    match = _SDS_FILE.match(name)
+    if match is None:
+        return True
+    day = np.datetime64(match.group(5), "D") + int(match.group(6)) - 1
+    midnight = int(day.astype("datetime64[ns]").astype(np.int64))
+    return (begin is None or midnight + 2 * _DAY_NS > begin) and (end is None or midnight - _DAY_NS < end)
+
+
+class _FileReader:
+    """Reads whole files through obspy, keeping the last few."""
+
+    def __init__(self, files: int = 6) -> None:
+        self._kept: OrderedDict[Path, Any] = OrderedDict()
+        self._files = files
+
+    def pieces(self, path: Path) -> Iterator[tuple[str, Piece]]:
+        number = -1
+        for trace in _read_with_obspy(path, headonly=True):
+            number += 1
+            if trace.stats.npts > 0 and trace.stats.sampling_rate > 0:
+                yield trace.id, _trace_piece(trace, partial(self._read, path, number))
+
+    def _read(self, path: Path, number: int, first: int, last: int) -> np.ndarray:
+        if path not in self._kept:
+            self._kept[path] = _read_with_obspy(path, headonly=False)
+            while len(self._kept) > self._files:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(path)
+        data = self._kept[path][number].data[first:last]
+        if data.size != last - first or data.dtype.kind not in "iuf":
+            return np.full(last - first, np.nan, np.float32)
+        return np.ma.filled(data.astype(np.float64), np.nan) if np.ma.isMaskedArray(data) else data
+
+
+def _read_with_obspy(path: Path, headonly: bool) -> Any:
+    """Traces of a file in any format but pickle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            stream = _read_plain(str(path), headonly=headonly)
+        except WaveformError:
+            raise
+        except Exception as error:  # every plugin raises its own errors on a damaged file
+            detail = " ".join(str(error).split())[:100] or type(error).__name__
+            raise WaveformError(f"cannot be read ({detail})") from None
+    return stream
+
+
+@uncompress_file
+def _read_plain(path: str, headonly: bool) -> Any:
+    for name, entry in ENTRY_POINTS["waveform"].items():
+        if name == "PICKLE":
+            continue
+        recognises = buffered_load_entry_point(entry.dist.name, f"obspy.plugin.waveform.{name}", "isFormat")
+        if recognises(path):
+            return obspy.read(path, format=name, headonly=headonly, check_compression=False)
+    raise WaveformError("no format that obspy reads")
+
+
+def _sort(
+    found: Iterable[tuple[str, Piece]],
+    station: Station,
+    min_rate_hz: float,
+    what: str,
+    report: WaveformReport,
+) -> dict[str, Timeline]:
+    """Pieces by channel of the station, the unusable ones set aside with a reason."""
+    known = {channel.seed_id for channel in station.epochs}
+    pieces: dict[str, list[Piece]] = {}
+    foreign: dict[str, str] = {}
+    for seed_id, piece in found:
+        own = _match(seed_id, known)
+        if own is None:
+            foreign[seed_id] = f"not described for {station.code}"
+        elif piece.rate < min_rate_hz * (1 - _RATE_TOLERANCE):
+            foreign[seed_id] = (
+                f"sampled at {piece.rate:g} Hz, below the {min_rate_hz:g} Hz that the analysis needs"
+            )
+        else:
+            if own != seed_id:
+                report.note(f"{seed_id} taken for {own}")
+            pieces.setdefault(own, []).append(piece)
+    for seed_id, reason in foreign.items():
+        report.note(f"{seed_id} left aside: {reason}")
+    if not pieces:
+        raise WaveformError(_nothing(what, station, foreign, report))
+    timelines = {seed_id: Timeline(pieces[seed_id]) for seed_id in sorted(pieces)}
+    for seed_id, timeline in timelines.items():
+        report.channels[seed_id] = _describe(timeline)
+    return timelines
+
+
+def _match(seed_id: str, known: set[str]) -> str | None:
+    """The station's channel that `seed_id` stands for, forgiving a location code or an empty network code."""
+    if seed_id in known:
+        return seed_id
+    network, station, _, channel = (seed_id.split(".") + [""] * 4)[:4]
+    alike = [
+        other
+        for other in known
+        if other.split(".")[1] == station
+        and other.split(".")[3] == channel
+        and network in ("", other.split(".")[0])
+    ]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _nothing(what: str, station: Station, foreign: dict[str, str], report: WaveformReport) -> str:
+    reasons: dict[str, list[str]] = {}
+    for path, reason in report.ignored.items():
+        reasons.setdefault(reason, []).append(Path(path).name)
+    found = [f"{_some(names)}: {reason}" for reason, names in reasons.items()]
+    found += [f"{seed_id} {reason}" for seed_id, reason in list(foreign.items())[:4]]
+    channels = ", ".join(sorted({channel.seed_id for channel in station.epochs})[:8])
+    inside = "; ".join(found) or ("no files" if not report.files else "no samples")
+    return f"no usable waveforms of {station.code} in {what} (found {inside}); wanted {channels}"
+
+
+def _some(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} files such as {names[0]}"
+
+
+def _describe(timeline: Timeline) -> ChannelReport:
+    """Summary of a timeline; overlaps are compared sample by sample over their first minute."""
+    return ChannelReport(
+        round(timeline.runs[0].rate, 6),
+        _iso(timeline.begin_ns),
+        _iso(timeline.end_ns),
+        gaps=len(timeline.runs) - 1,
+        gap_s=round(timeline.gap_s, 3),
+        overlaps=len(timeline.overlaps),
+        conflicting_overlaps=sum(_conflicts(timeline, o) for o in timeline.overlaps[:_CHECKED_OVERLAPS]),
+    )
+
+
+def _conflicts(timeline: Timeline, overlap: Any) -> bool:
+    late = overlap.late
+    first = late.first
+    for run in timeline.between(overlap.begin_ns, overlap.end_ns):
+        position = int(run.nearest(np.array([late.time_ns(first)]))[0])
+        if 0 <= position < run.length:
+            wanted = int(float(late.index(overlap.end_ns))) - first
+            count = min(wanted, run.length - position, int(_CHECKED_S * late.rate))
+            same = np.array_equal(run.read(position, position + count), late.read(first, first + count))
+            return not same
+    return False
