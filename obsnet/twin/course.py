@@ -143,5 +143,7 @@ def presence(course: Course, time: np.ndarray, fade_s: float = 600.0) -> np.ndar
 
 
 def local_projection(latitude: float, longitude: float) -> Proj:
-    """Azimuthal equidistant projection around a station: east and north [m] of longitude and latitude [deg]."""
+    """Azimuthal equidistant projection around a station: east and north [m] of longitude and latitude
+    [deg].
+    """
     return Proj(proj="aeqd", lat_0=latitude, lon_0=longitude, ellps="WGS84")

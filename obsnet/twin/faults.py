@@ -53,6 +53,18 @@ class Faults:
         if len(self.late_s) != 4 or min(self.late_s) < 0:
             raise ConfigError(f"late_s holds a delay for each of H, 1, 2, Z, found {self.late_s}")
 
+    @classmethod
+    def random(cls, generator: np.random.Generator, hours: float) -> Faults:
+        """Draw gaps of seconds to half an hour, in a third of the records, some on one channel only."""
+        if generator.random() > 1 / 3:
+            return cls()
+        gaps = []
+        for _ in range(1 + generator.poisson(1.0)):
+            duration = float(np.exp(generator.uniform(np.log(2.0), np.log(1800.0))))
+            where = "H12Z" if generator.random() < 0.7 else str(generator.choice(list("H12Z")))
+            gaps.append(Gap(float(generator.uniform(0.0, hours * 3600.0)), duration, where))
+        return cls(gaps=tuple(gaps))
+
     def pieces(
         self, part: str, first: int, counts: np.ndarray, sampling_rate: float, start: float
     ) -> Iterator[tuple[int, np.ndarray]]:

@@ -12,14 +12,14 @@ source: incident and reflected wave have the same horizontal slowness.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
-from obsnet.errors import LayoutError
+from obsnet.errors import ConfigError, LayoutError
 from obsnet.layout import PROPAGATION, require
 from obsnet.ocean.bottom import Bottom
 from obsnet.twin.course import Course, presence
@@ -27,6 +27,35 @@ from obsnet.twin.course import Course, presence
 OVERSAMPLING = 2
 TAPS = 12
 PHASES = 512
+
+
+@dataclass(frozen=True)
+class Sediment:
+    """A reflector below the sea floor: every meeting of a path with the bottom adds a weak echo.
+
+    Parameters
+    ----------
+    thickness_m : float
+        Depth of the reflector below the sea floor.
+    speed_mps : float
+        Sound speed above it.
+    reflection : float
+        Amplitude of the echo of one meeting over that of the path; the (k + 1)/2 meetings of path k add up.
+    """
+
+    thickness_m: float = 60.0
+    speed_mps: float = 1650.0
+    reflection: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not (self.thickness_m > 0 and self.speed_mps > 0 and abs(self.reflection) < 1):
+            raise ConfigError(
+                f"a sediment needs thickness and speed > 0 and a reflection within ±1, found {self}"
+            )
+
+    def delay(self, slowness: np.ndarray) -> np.ndarray:
+        """Two-way vertical delay 2h √(1/c² − p²) [s]."""
+        return 2 * self.thickness_m * np.sqrt(np.maximum(self.speed_mps**-2.0 - slowness**2, 0.0))
 
 
 @dataclass(frozen=True)
@@ -52,7 +81,8 @@ class _Column:
 class Paths:
     """A propagation table as functions of range; a path has zero pressure where it does not exist."""
 
-    def __init__(self, table: xr.Dataset) -> None:
+    def __init__(self, table: xr.Dataset, sediment: Sediment | None = None) -> None:
+        self.sediment = sediment
         require(table, PROPAGATION)
         table = table.transpose("path", "range", ...)
         self.range_m = table["range"].values.astype(float)
@@ -167,8 +197,11 @@ def add_moving_source(
     grid = np.arange(-margin, knots[-1] + 2.0, 1.0)
     if not np.any(presence(course, start + grid)):
         return
-    tracks = [_track(paths, k, course, source_depth_m, start, knots, grid) for k in range(len(paths))]
-    heard = [track for track in tracks if track is not None]
+    heard = [
+        track
+        for k in range(len(paths))
+        for track in _tracks(paths, k, course, source_depth_m, start, knots, grid)
+    ]
     if not heard:
         return
     low = min(track.emitted.min() for track in heard)
@@ -177,7 +210,7 @@ def add_moving_source(
     length = int(np.ceil((high - low) * rate)) + 4 * TAPS
     signal = emission.samples(begin, length)  # type: ignore[attr-defined]
     for track in heard:
-        position = (track.emitted - (begin / rate - start)) * rate
+        position = track.emitted * rate + (OVERSAMPLING * first - begin)
         _add_path(
             field.pressure, field.east, field.north, field.down, signal, position, track.dipole * rate,
             track.pressure, track.east, track.north, track.down, step, INTERPOLATOR,
@@ -186,7 +219,9 @@ def add_moving_source(
 
 @dataclass(frozen=True)
 class _Track:
-    """One path against heard time, at knots: emission time [s from the start], δ [s], complex pressure, v/p."""
+    """One path against heard time, at knots: emission time [s from the start], δ [s], complex pressure,
+    v/p.
+    """
 
     emitted: np.ndarray
     dipole: np.ndarray
@@ -195,13 +230,19 @@ class _Track:
     north: np.ndarray
     down: np.ndarray
 
+    def echo(self, later: np.ndarray, weight: float) -> _Track:
+        """The same arrival `later` [s] and weaker."""
+        return replace(
+            self, emitted=self.emitted - later, pressure=self.pressure * weight, down=self.down * weight
+        )
 
-def _track(
+
+def _tracks(
     paths: Paths, path: int, course: Course, depth: float, start: float, knots: np.ndarray, grid: np.ndarray
-) -> _Track | None:
+) -> list[_Track]:
     arrival = paths.arrival(path, np.hypot(*course.position(start + grid)))
     if arrival is None:
-        return None
+        return []
     emitted = np.interp(knots, grid + arrival.delay, grid)
     for _ in range(2):  # a contraction by speed over sound speed
         east, north = course.position(start + emitted)
@@ -210,9 +251,9 @@ def _track(
         emitted = knots - arrival.delay
     pressure = arrival.pressure * presence(course, start + emitted)
     if not np.any(np.abs(pressure) > 0):
-        return None
+        return []
     towards = -arrival.slowness / paths.water_density / np.maximum(distance, 1e-3)
-    return _Track(
+    track = _Track(
         emitted,
         paths.dipole_delay(depth, arrival.slowness),
         pressure,
@@ -220,6 +261,10 @@ def _track(
         towards * north,
         pressure * arrival.admittance,
     )
+    if paths.sediment is None:
+        return [track]
+    weight = paths.sediment.reflection * (paths.numbers[path] + 1) / 2
+    return [track, track.echo(paths.sediment.delay(arrival.slowness), weight)]
 
 
 def _interpolator() -> np.ndarray:

@@ -48,6 +48,9 @@ class Ambient:
         Own noise of the hydrophone at 10 Hz, dB re 1 µPa²/Hz, growing as 1/f below.
     seismometer_noise_db : float
         Own noise of the seismometer, dB re 1 (m/s²)²/Hz.
+    chorus_db : float
+        PSD of distant whales together at 26 Hz (blue) and 6 dB less at 20 Hz (fin), dB re 1 µPa²/Hz; −inf is
+        none.
     tilt_noise_db : float
         Noise of currents on the horizontals at 0.1 Hz, dB re 1 (m/s²)²/Hz, falling 30 dB per decade.
     """
@@ -65,6 +68,7 @@ class Ambient:
     hydrophone_noise_db: float = 48.0
     seismometer_noise_db: float = -165.0
     tilt_noise_db: float = -125.0
+    chorus_db: float = -np.inf
 
     def __post_init__(self) -> None:
         if not 0 <= self.directional_fraction <= 1:
@@ -100,12 +104,15 @@ class Ambient:
             vertical_coherence=float(generator.uniform(0.1, 0.6)),
             seismometer_noise_db=float(generator.uniform(-172.0, -150.0)),
             tilt_noise_db=float(generator.uniform(-140.0, -110.0)),
+            chorus_db=float(generator.choice([-np.inf, generator.uniform(75.0, 95.0)], p=[0.6, 0.4])),
         )
 
     def sea_psd(self, frequency: np.ndarray) -> np.ndarray:
         """One-sided PSD of the sea noise's pressure [Pa²/Hz], levelling off below 2 Hz."""
         hertz = np.maximum(frequency, 2.0)
-        return _power(self.level_db - 120.0) * (hertz / REFERENCE_HZ) ** (-self.slope_db / 10)
+        blue, fin = np.exp(-0.5 * ((hertz - 25.8) / 0.6) ** 2), np.exp(-0.5 * ((hertz - 20.0) / 1.6) ** 2)
+        chorus = _power(self.chorus_db - 120.0) * (blue + 0.25 * fin)
+        return _power(self.level_db - 120.0) * (hertz / REFERENCE_HZ) ** (-self.slope_db / 10) + chorus
 
     def microseism_psd(self, frequency: np.ndarray) -> np.ndarray:
         """One-sided PSD of the microseism's pressure [Pa²/Hz]: f⁸ below its peak, f⁻⁵ above."""

@@ -46,7 +46,7 @@ class LineSeries:
     def __post_init__(self) -> None:
         if len(self.harmonics) != len(self.levels_db):
             raise ConfigError(
-                f"a line series needs one level per harmonic, found {len(self.levels_db)} levels for {len(self.harmonics)}"
+                f"lines need a level per harmonic, found {len(self.levels_db)} for {len(self.harmonics)}"
             )
         if not self.rate_hz > 0 or any(k < 1 for k in self.harmonics):
             raise ConfigError(
@@ -179,11 +179,13 @@ class Emission:
     """
 
     def __init__(self, ship: Ship, sampling_rate: float, passband_rate: float) -> None:
-        """`passband_rate` is the recorder's sampling rate, to whose Nyquist frequency the sound is limited."""
+        """`passband_rate` is the recorder's sampling rate, to whose Nyquist frequency the sound is
+        limited.
+        """
         self.ship, self.sampling_rate, self.passband_rate = ship, sampling_rate, passband_rate
         generator = np.random.default_rng([ship.seed, 2])
         self._level = Wander(generator, ship.level_spread_db, 150.0, 4 * 3600.0)
-        self._trains = [_LineTrain(series, generator, passband_rate) for series in ship.lines]
+        self._trains = [LineTrain(series, generator, passband_rate) for series in ship.lines]
 
     def _colour(self, frequency: np.ndarray, variates: np.ndarray) -> np.ndarray:
         amplitude = MICROPASCAL * 10 ** (self.ship.spectrum_level_db(frequency) / 20)
@@ -205,7 +207,11 @@ class Emission:
         return noise
 
 
-class _LineTrain:
+class LineTrain:
+    """A line series as a function of absolute time: its rate wanders, and each line has its own slow
+    level.
+    """
+
     def __init__(self, series: LineSeries, generator: np.random.Generator, passband_rate: float) -> None:
         self.rate = series.rate_hz
         self.wander = Wander(generator, series.rate_hz * series.rate_spread, 60.0, 2 * 3600.0)
@@ -220,6 +226,9 @@ class _LineTrain:
     def add(
         self, signal: np.ndarray, first: int, sampling_rate: float, blades: int, modulation: float
     ) -> None:
+        """Add the lines to an analytic `signal` that begins at sample `first`; modulate it at `blades`
+        times the rate.
+        """
         count = signal.size
         step = max(round(PHASE_KNOT_S * sampling_rate), 1)
         wander = self.wander.integral(_knots(first, count, step, sampling_rate))

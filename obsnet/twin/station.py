@@ -1,12 +1,17 @@
-"""The whole twin: a scenario (ships on courses, sea, recorder, faults) becomes waveforms, StationXML, AIS and
-the truth.
+"""The whole twin: a scenario becomes the waveforms, StationXML, AIS and truth of a simulated
+ocean-bottom station.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import json
+import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pandas as pd
@@ -14,121 +19,32 @@ import xarray as xr
 from obspy import Stream, Trace, UTCDateTime
 from obspy.core.inventory import Inventory
 
-from obsnet.errors import ConfigError
-from obsnet.kinematics import StraightCourse
+from obsnet.errors import OutputError
+from obsnet.layout import iso
 from obsnet.ocean.rays import propagation_table
-from obsnet.ocean.sound_speed import OceanConfig
 from obsnet.twin.course import Course
-from obsnet.twin.faults import Faults
-from obsnet.twin.instrument import Recorder
 from obsnet.twin.noise import sample_index
 from obsnet.twin.propagate import OVERSAMPLING, Field, Paths, add_moving_source
-from obsnet.twin.sea import Ambient, add_ambient
-from obsnet.twin.ship import Emission, Ship
+from obsnet.twin.scenario import Passage, Scenario
+from obsnet.twin.sea import add_ambient
+from obsnet.twin.seafloor import add_earthquakes, add_tremor
+from obsnet.twin.ship import Emission
 from obsnet.twin.truth import Truth, ais_of, truth_of
+from obsnet.twin.whales import add_whale
+
+__all__ = ["Passage", "Scenario", "Simulation", "simulate", "simulate_blocks", "write_simulation"]
 
 BLOCK_S = 3600.0
 CONTEXT_S = 150.0
-MAX_RANGE_M = 130_000.0
+WAVEFORMS, METADATA, AIS, MINUTES, PASSAGES = (
+    "waveforms.mseed",
+    "station.xml",
+    "ais.csv",
+    "truth.csv",
+    "truth.json",
+)
 
-
-@dataclass(frozen=True)
-class Passage:
-    """A ship and where it goes."""
-
-    ship: Ship
-    course: Course
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """Everything that makes a record.
-
-    Parameters
-    ----------
-    start : float
-        First sample not before this, s since 1970.
-    hours : float
-        Length of the record.
-    passages : tuple of Passage
-        Ships and courses; none is a record of the sea.
-    recorder : Recorder
-        The station.
-    ambient : Ambient or None
-        The background; None is silence.
-    faults : Faults
-        Gaps, dead or clipped channels.
-    ocean : OceanConfig
-        From which the propagation table is made.
-    seed : int
-        Of everything but the ships, which have their own.
-    """
-
-    start: float = 1369130400.0
-    hours: float = 8.0
-    passages: tuple[Passage, ...] = ()
-    recorder: Recorder = field(default_factory=Recorder)
-    ambient: Ambient | None = field(default_factory=Ambient)
-    faults: Faults = field(default_factory=Faults)
-    ocean: OceanConfig = field(default_factory=lambda: OceanConfig(max_range_m=MAX_RANGE_M))
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.hours > 0:
-            raise ConfigError(f"hours must be positive, found {self.hours}")
-        mmsi = [passage.ship.mmsi for passage in self.passages]
-        if len(set(mmsi)) != len(mmsi):
-            raise ConfigError(f"ships must have different mmsi, found {mmsi}")
-
-    @property
-    def end(self) -> float:
-        """End of the record, s since 1970."""
-        return self.start + 3600.0 * self.hours
-
-    @classmethod
-    def random(
-        cls,
-        seed: int,
-        hours: float = 8.0,
-        ships: int = 1,
-        start: float = 1369130400.0,
-        sampling_rate: float = 50.0,
-        **fixed: object,
-    ) -> Scenario:
-        """Draw a record: ships, courses, recorder and sea; fields given in `fixed` are kept.
-
-        CPA times are uniform over the middle of the record, CPA ranges over ±30 km, courses over all
-        directions, speeds over 6–13 m/s.
-        """
-        generator = np.random.default_rng([seed, 0x0B5])
-        passages = tuple(_draw_passage(generator, seed, i, start, hours) for i in range(ships))
-        drawn: dict[str, object] = {
-            "start": start,
-            "hours": hours,
-            "passages": passages,
-            "recorder": Recorder.random(generator, sampling_rate),
-            "ambient": Ambient.random(generator),
-            "seed": seed,
-        }
-        return cls(**{**drawn, **fixed})  # type: ignore[arg-type]
-
-    def replace(self, **changes: object) -> Scenario:
-        """The same scenario with some fields changed."""
-        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
-
-
-def _draw_passage(
-    generator: np.random.Generator, seed: int, number: int, start: float, hours: float
-) -> Passage:
-    margin = min(0.25 * hours, 2.0)
-    cpa_time = start + 3600.0 * float(generator.uniform(margin, hours - margin))
-    course = StraightCourse(
-        cpa_time,
-        float(generator.uniform(-30e3, 30e3)),
-        float(generator.uniform(0.0, 360.0)),
-        float(generator.uniform(6.0, 13.0)),
-    )
-    return Passage(Ship.random(1000 * seed + number, 100000001 + number), course)
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -155,11 +71,28 @@ class Simulation:
         """Courses of the ships."""
         return tuple(passage.course for passage in self.scenario.passages)
 
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write waveforms.mseed (STEIM2), station.xml, ais.csv, truth.csv (minutes) and truth.json
+        (passages).
+
+        Each file appears whole or not at all.
+
+        Raises
+        ------
+        OutputError
+            The folder cannot be made or written to.
+        """
+        with _writing(Path(folder)) as target:
+            with _whole(target / WAVEFORMS) as file:
+                _append(file, self.stream)
+            return [
+                target / WAVEFORMS,
+                *_write_tables(target, self.inventory, self.ais, self.truth, self.scenario),
+            ]
+
 
 def simulate(
-    scenario: Scenario,
-    table: xr.Dataset | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    scenario: Scenario, table: xr.Dataset | None = None, progress: Progress | None = None
 ) -> Simulation:
     """Simulate a record.
 
@@ -177,31 +110,56 @@ def simulate(
     The samples depend on absolute time, on the seeds and on the sampling rate only: a longer or a later
     record of the same scenario has the same samples where they overlap.
     """
-    table = propagation_table(scenario.ocean, scenario.recorder.depth_m) if table is None else table
-    blocks = list(_counts(scenario, Paths(table), progress))
+    paths = _paths(scenario, table)
+    blocks = list(_counts(scenario, paths, progress))
     parts = {
         part: np.concatenate([block[part] for _, block in blocks]) for part in scenario.recorder.channels
     }
     stream = _stream(scenario, blocks[0][0], parts)
     return Simulation(
-        stream, scenario.recorder.inventory(), ais_of(scenario), truth_of(scenario, Paths(table)), scenario
+        stream, scenario.recorder.inventory(), ais_of(scenario), truth_of(scenario, paths), scenario
     )
 
 
 def simulate_blocks(
-    scenario: Scenario, table: xr.Dataset | None = None, progress: Callable[[int, int], None] | None = None
+    scenario: Scenario, table: xr.Dataset | None = None, progress: Progress | None = None
 ) -> Iterator[Stream]:
     """Simulate the same record hour by hour in flat memory; the streams join without a seam."""
-    table = propagation_table(scenario.ocean, scenario.recorder.depth_m) if table is None else table
-    for first, block in _counts(scenario, Paths(table), progress):
+    for first, block in _counts(scenario, _paths(scenario, table), progress):
         yield _stream(scenario, first, block)
 
 
+def write_simulation(
+    scenario: Scenario, folder: str | Path, table: xr.Dataset | None = None, progress: Progress | None = None
+) -> list[Path]:
+    """Simulate a record of any length straight into the files of `Simulation.write`, in flat memory.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be made or written to.
+    """
+    paths = _paths(scenario, table)
+    with _writing(Path(folder)) as target:
+        with _whole(target / WAVEFORMS) as file:
+            for first, block in _counts(scenario, paths, progress):
+                _append(file, _stream(scenario, first, block))
+        tables = _write_tables(
+            target, scenario.recorder.inventory(), ais_of(scenario), truth_of(scenario, paths), scenario
+        )
+        return [target / WAVEFORMS, *tables]
+
+
+def _paths(scenario: Scenario, table: xr.Dataset | None) -> Paths:
+    table = propagation_table(scenario.ocean, scenario.recorder.depth_m) if table is None else table
+    return Paths(table, scenario.sediment)
+
+
 def _counts(
-    scenario: Scenario, paths: Paths, progress: Callable[[int, int], None] | None
+    scenario: Scenario, paths: Paths, progress: Progress | None
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Counts of each component in the hours of the absolute grid that the record touches, with their first
-    sample.
+    """Counts of each component in the hours of the absolute grid that the record touches, with their
+    first sample.
     """
     rate = scenario.recorder.sampling_rate
     first, last = sample_index(scenario.start, rate), sample_index(scenario.end, rate)
@@ -210,13 +168,7 @@ def _counts(
     blocks = range(first // size, (last - 1) // size + 1)
     for done, block in enumerate(blocks):
         motion = Field.silence(size + 2 * context)
-        begin = block * size - context
-        for passage, emission in zip(scenario.passages, emissions, strict=True):
-            add_moving_source(
-                motion, begin, rate, passage.course, passage.ship.source_depth_m, emission, paths
-            )
-        if scenario.ambient is not None:
-            add_ambient(motion, begin, rate, scenario.ambient, scenario.seed)
+        _fill(motion, block * size - context, scenario, emissions, paths)
         counts = scenario.recorder.record(motion, context, size)
         low, high = max(first - block * size, 0), min(last - block * size, size)
         yield block * size + low, {part: values[low:high] for part, values in counts.items()}
@@ -224,24 +176,95 @@ def _counts(
             progress(done + 1, len(blocks))
 
 
+def _fill(motion: Field, first: int, scenario: Scenario, emissions: list[Emission], paths: Paths) -> None:
+    rate = scenario.recorder.sampling_rate
+    for passage, emission in zip(scenario.passages, emissions, strict=True):
+        add_moving_source(motion, first, rate, passage.course, passage.ship.source_depth_m, emission, paths)
+    if scenario.ambient is not None:
+        add_ambient(motion, first, rate, scenario.ambient, scenario.seed)
+    for whale in scenario.whales:
+        add_whale(motion, first, rate, whale, paths)
+    if scenario.earthquakes is not None:
+        add_earthquakes(motion, first, rate, scenario.earthquakes)
+    if scenario.tremor is not None:
+        add_tremor(motion, first, rate, scenario.tremor)
+
+
 def _stream(scenario: Scenario, first: int, parts: dict[str, np.ndarray]) -> Stream:
     recorder = scenario.recorder
     network, station = recorder.code.split(".")
+    rate = recorder.sampling_rate
     stream = Stream()
     for part, code in recorder.channels.items():
-        for offset, counts in scenario.faults.pieces(
-            part, first, parts[part], recorder.sampling_rate, scenario.start
-        ):
-            trace = Trace(np.ascontiguousarray(counts))
-            trace.stats.update(
-                {
-                    "network": network,
-                    "station": station,
-                    "location": "00",
-                    "channel": code,
-                    "sampling_rate": recorder.sampling_rate,
-                }
-            )
-            trace.stats.starttime = UTCDateTime(ns=round((first + offset) * 1e9 / recorder.sampling_rate))
-            stream.append(trace)
+        for offset, counts in scenario.faults.pieces(part, first, parts[part], rate, scenario.start):
+            header = {
+                "network": network,
+                "station": station,
+                "location": "00",
+                "channel": code,
+                "sampling_rate": rate,
+                "starttime": UTCDateTime(ns=round((first + offset) * 1e9 / rate)),
+            }
+            stream.append(Trace(counts.copy(), header))
     return stream
+
+
+def _append(file: BinaryIO, stream: Stream) -> None:
+    for trace in stream:
+        buffer = BytesIO()
+        trace.write(buffer, format="MSEED", encoding="STEIM2", reclen=4096)
+        file.write(buffer.getvalue())
+
+
+def _write_tables(
+    target: Path, inventory: Inventory, ais: pd.DataFrame, truth: Truth, scenario: Scenario
+) -> list[Path]:
+    stamps = dict.fromkeys(("time", "emitted"), "%Y-%m-%dT%H:%M:%S.%fZ")
+    with _whole(target / METADATA) as file:
+        inventory.write(file, format="STATIONXML")
+    for name, frame in ((AIS, ais), (MINUTES, truth.minutes)):
+        text = frame.copy()
+        for column in stamps.keys() & set(text.columns):
+            text[column] = text[column].dt.strftime(stamps[column]).str.replace(".000000Z", "Z", regex=False)
+        with _whole(target / name) as file:
+            file.write(text.to_csv(index=False, float_format="%.9g").encode())
+    rows = truth.passages.assign(
+        cpa_time=[iso(time) for time in truth.passages["cpa_time"].to_numpy("datetime64[ns]")]
+    )
+    known = {
+        "simulated": True,
+        "station": scenario.recorder.code,
+        "start": iso(scenario.start),
+        "end": iso(scenario.end),
+        "seed": scenario.seed,
+        "orientation_deg": scenario.recorder.orientation_deg,
+        "hydrophone_polarity": scenario.recorder.hydrophone_polarity,
+        "passages": rows.to_dict("records"),
+    }
+    with _whole(target / PASSAGES) as file:
+        file.write(json.dumps(known, indent=2).encode())
+    return [target / name for name in (METADATA, AIS, MINUTES, PASSAGES)]
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[Path]:
+    """Make the output folder; what the system refuses is an `OutputError`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except (FileExistsError, NotADirectoryError):
+        raise OutputError(f"cannot write the simulation to {folder}: it is a file, name a folder") from None
+    except OSError as error:
+        raise OutputError(f"cannot write the simulation to {folder}: {error.strerror or error}") from None
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
+    """A file that takes its name only when it is complete."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(partial, "wb") as file:
+            yield file
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
