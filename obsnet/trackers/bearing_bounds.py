@@ -47,9 +47,10 @@ def derivatives(theta: np.ndarray, time: np.ndarray, speed_mps: float | np.ndarr
     -------
     array (..., K, 4), deg/m, deg/m, deg/deg, deg/(m/s)
     """
+    time = np.asarray(time, float)
     east, north, sin, cos = _path(theta, time, speed_mps)
     squared = np.maximum(east**2 + north**2, 1e-12)
-    along = np.asarray(speed_mps, float)[..., None] * np.asarray(time, float)
+    along = np.asarray(speed_mps, float)[..., None] * time
     turn = along * (north * cos + east * sin) / squared
     scale = time * (north * sin - east * cos) / squared
     return np.stack(
@@ -218,7 +219,7 @@ def cpa_jacobian(theta: np.ndarray, speed_mps: float) -> np.ndarray:
 
 
 def _rates(theta: np.ndarray, speed_mps: float) -> tuple[np.ndarray, np.ndarray]:
-    """(ω, ρ) [1/s] at time zero and their derivatives with respect to x0, y0 [m], course [deg], speed [m/s]."""
+    """(ω, ρ) [1/s] at time zero and their derivatives over x0, y0 [m], course [deg], speed [m/s]."""
     x, y, course = theta
     vx, vy = speed_mps * np.sin(np.deg2rad(course)), speed_mps * np.cos(np.deg2rad(course))
     squared = x**2 + y**2

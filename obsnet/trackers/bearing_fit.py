@@ -2,7 +2,7 @@
 
 The speed is given. Bearings fix the course, the CPA time and the side on which the ship passes, but range
 only in units of the speed: x0, y0 and v may all be multiplied by one number (Urazghildiiev & Hannay, eq. 6).
-So the best estimate of the speed is the mean of its prior, its posterior is its prior, and a relative error of
+So the best estimate of the speed is its prior mean, its posterior is its prior, and a relative error of
 the speed is the same relative error of every range.
 
 The likelihood is maximised in modified polar coordinates at mid-observation: azimuth α0, turn rate ω and
@@ -219,7 +219,7 @@ def _slopes(polar: np.ndarray, unit_time: np.ndarray, white: np.ndarray) -> np.n
 
 
 def to_theta(polar: np.ndarray, half_s: float, speed: np.ndarray) -> np.ndarray:
-    """(x0, y0, course) [m, m, deg], (R, 3), of polar coordinates in units of `half_s`, for each speed [m/s]."""
+    """(x0, y0, course) [m, m, deg], (R, 3), of polar coordinates in units of `half_s` at a speed [m/s]."""
     rates = polar[:, 1:] / half_s
     distance = speed / np.maximum(np.hypot(*rates.T), 1e-12)
     course = np.rad2deg(polar[:, 0] + np.arctan2(rates[:, 0], rates[:, 1])) % 360.0

@@ -1,8 +1,8 @@
 """A ship's course from the station's bearings alone, for when no range was heard.
 
 The errors' covariance is in `bearing_errors`, the geometry and the Cramér-Rao bounds in `bearing_bounds`, the
-maximum-likelihood fit in `bearing_fit` (Urazghildiiev & Hannay). A station's minutes also hold false ones: the
-course is found under a mixture of independent Gaussian errors and a uniform share, with the errors' size
+maximum-likelihood fit in `bearing_fit` (Urazghildiiev & Hannay). A station's minutes also hold false ones:
+the course is found under a mixture of independent Gaussian errors and a uniform share, the errors' size
 annealed; then what is more probably false is left out and the rest is fitted with its full covariance.
 """
 
@@ -197,7 +197,7 @@ def _candidates(record: _Record, unit_time: np.ndarray, count: int = 3) -> np.nd
 def _robust_fit(
     record: _Record, unit_time: np.ndarray, starts: np.ndarray, free: int
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Best of `starts` under independent errors and false bearings; then the true ones with their covariance."""
+    """Best of `starts` under independent errors and false bearings; then the true ones, whitened."""
     annealed = [_anneal(record, unit_time, start[None], free) for start in starts]
     polar = annealed[int(np.argmax([score for _, score in annealed]))][0]
     radians = np.deg2rad(record.azimuth)[None]
