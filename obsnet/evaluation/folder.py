@@ -1,0 +1,119 @@
+"""A run's folder and an AIS file in, the run's evaluation out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from obsnet.ais import ReferenceTrack, read, reference_tracks
+from obsnet.ais.tracks import DelayFunction
+from obsnet.config import build
+from obsnet.errors import ConfigError, LayoutError
+from obsnet.evaluation.detections import DetectionCriteria
+from obsnet.evaluation.score import DETECTIONS, TRACKS, evaluate
+from obsnet.evaluation.table import Evaluation
+from obsnet.evaluation.tracks import utc
+
+
+def evaluate_folder(
+    folder: str | Path,
+    ais: str | Path | list[ReferenceTrack],
+    *,
+    max_range_m: float = 100e3,
+    max_cpa_m: float = 25e3,
+    merchant_only: bool = False,
+) -> Evaluation:
+    """Score the run in a folder written by ``obsnet track`` against an AIS file.
+
+    The station and the ocean, hence the sound's travel time, are those of the folder's run.json. Parameters
+    as for `obsnet.ais.reference_tracks`.
+
+    Raises
+    ------
+    LayoutError
+        The folder is not one of a run. AISError: the AIS file cannot serve.
+    """
+    detections, tracks, info = read_run(folder)
+    try:
+        station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
+        place = station["latitude"], station["longitude"]
+        delay = _delay_of_run(info["config"], station["depth_m"])
+        notes = info.get("notes", [])
+    except (KeyError, TypeError, ValueError) as error:
+        raise LayoutError(
+            f"{folder}/run.json does not describe a run of obsnet ({error}); run obsnet track again"
+        ) from None
+    if not isinstance(ais, list):
+        positions = read(ais, near=place, within_m=max_range_m + 400e3)
+        ais = reference_tracks(
+            positions, place, max_range_m=max_range_m, max_cpa_m=max_cpa_m, merchant_only=merchant_only
+        )
+    ambiguous = any("180°" in str(note) for note in notes)
+    return evaluate(
+        detections, tracks, ais, delay, DetectionCriteria(azimuth_period_deg=180.0 if ambiguous else 360.0)
+    )
+
+
+def read_run(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
+    """Detections, tracks and run.json of a folder written by ``obsnet track``.
+
+    Raises
+    ------
+    LayoutError
+        A file is missing, is no table, lacks a column or holds an unreadable value.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise LayoutError(f"{folder} is not a folder; give one that obsnet track has written")
+    detections = _read_table(folder / "detections.csv", DETECTIONS, ("time",))
+    tracks = _read_table(folder / "tracks.csv", TRACKS, ("cpa_time",))
+    try:
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise LayoutError(
+            f"cannot read {folder / 'run.json'}: {_reason(error)}; run obsnet track again"
+        ) from None
+    return detections, tracks, info if isinstance(info, dict) else {}
+
+
+def _read_table(path: Path, columns: tuple[str, ...], times: tuple[str, ...]) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path)
+        missing = [column for column in columns if column not in table]
+        if missing:
+            found = ", ".join(map(str, table.columns))
+            raise LayoutError(f"{path} lacks the column {', '.join(missing)}; found {found[:200]}")
+        for column in columns:
+            if column in times:
+                table[column] = utc(table[column])
+            else:
+                table[column] = pd.to_numeric(table[column]).astype(float)
+    except OSError as error:
+        raise LayoutError(
+            f"cannot read {path}: {_reason(error)}; give a folder that obsnet track has written"
+        ) from None
+    except (ValueError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        if isinstance(error, LayoutError):
+            raise
+        raise LayoutError(f"{path} is not a table of obsnet: {_reason(error)}") from None
+    return table
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
+
+
+def _delay_of_run(config: dict[str, Any], depth_m: float) -> DelayFunction:
+    from obsnet.ocean.rays import propagation_table
+    from obsnet.pipeline import RunConfig
+    from obsnet.run import travel_time
+
+    try:
+        return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m))
+    except ConfigError as error:
+        raise LayoutError(
+            f"run.json is of another version of obsnet: {error}; run obsnet track again"
+        ) from None
