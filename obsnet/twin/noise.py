@@ -60,8 +60,8 @@ def gaussian_noise(
     """
     hop, fade = round(HOP_S * sampling_rate), round(FADE_S * sampling_rate)
     length = hop + fade
-    ramp = np.sin(0.5 * np.pi * (np.arange(fade) + 0.5) / fade).astype(np.float32)
-    window = np.concatenate([ramp, np.ones(hop - fade, np.float32), ramp[::-1]])
+    angle = 0.5 * np.pi * np.arange(fade) / fade
+    window = np.concatenate([np.sin(angle), np.ones(hop - fade), np.cos(angle)]).astype(np.float32)
     frequency = np.arange(length // 2 + 1) * (sampling_rate / length)
     out: np.ndarray | None = None
     for block in range((first - length) // hop + 1, (first + count - 1) // hop + 1):
