@@ -1,8 +1,8 @@
 """miniSEED 2 files in, pieces of waveform out, each record at the time that its own header gives.
 
-obspy joins records whose starts agree within half a sample of the record before, and forgets every start but the first;
-the records of a drift-corrected ocean-bottom clock walk away from that by seconds over a deployment. Only the records
-asked for are read, so that a file of a month costs the memory of a block.
+obspy joins records whose starts agree within half a sample of the record before, and forgets every start
+but the first; the records of a drift-corrected ocean-bottom clock walk away from that by seconds over a
+deployment. Only the records asked for are read, so that a file of a month costs the memory of a block.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import io
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import obspy
@@ -69,7 +71,7 @@ class RecordReader:
         self.damaged = 0
 
     def pieces(self, path: Path) -> tuple[list[tuple[str, Piece]], RecordFile] | None:
-        """Every unbroken stretch of every channel; None if the file is not miniSEED with records of one length."""
+        """Every unbroken stretch of every channel; None unless miniSEED with records of one length."""
         file = self._index(path)
         if file is None:
             return None
@@ -155,7 +157,7 @@ def _stretches(table: np.ndarray) -> list[tuple[int, int]]:
     late = np.abs(table["start_ns"][1:] - ends[:-1]) / _SECOND * table["rate"][1:]
     breaks = np.flatnonzero((late > JOIN_SAMPLES) | (table["rate"][1:] != table["rate"][:-1])) + 1
     edges = [0, *breaks.tolist(), table.size]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))
 
 
 def _piece(channel: ChannelRecords, first: int, last: int, read: partial[np.ndarray]) -> Piece:
@@ -190,7 +192,7 @@ def _layout(head: bytes) -> tuple[int, str] | None:
     if len(head) < 64 or not _looks_like_data(np.frombuffer(head[:64], np.uint8)[None])[0]:
         return None
     order = ">" if 1900 <= int.from_bytes(head[20:22], "big") <= 2200 else "<"
-    word = "big" if order == ">" else "little"
+    word: Literal["big", "little"] = "big" if order == ">" else "little"
     position = int.from_bytes(head[46:48], word)
     while 48 <= position <= len(head) - 8:
         if int.from_bytes(head[position : position + 2], word) == 1000:
@@ -207,13 +209,17 @@ def _looks_like_data(raw: np.ndarray) -> np.ndarray:
 
 
 def _parse(raw: np.ndarray, order: str, base: int) -> np.ndarray:
-    """Table of the fixed headers and blockettes 100, 1000 and 1001 of records, one a row of `raw` (SEED 2.4, ch. 8)."""
+    """Table of the headers and blockettes 100, 1000, 1001 of records, one a row (SEED 2.4, ch. 8)."""
     table = np.zeros(len(raw), _TABLE)
     rows = np.arange(len(raw))
 
     def number(at: int | np.ndarray, kind: str) -> np.ndarray:
         width = np.dtype(kind).itemsize
-        field = raw[:, at : at + width] if isinstance(at, int) else raw[rows[:, None], at[:, None] + np.arange(width)]
+        field = (
+            raw[:, at : at + width]
+            if isinstance(at, int)
+            else raw[rows[:, None], at[:, None] + np.arange(width)]
+        )
         values = np.ascontiguousarray(field).view(order + kind)[:, 0]
         return values if kind == "f4" else values.astype(np.int64)
 
@@ -226,7 +232,9 @@ def _parse(raw: np.ndarray, order: str, base: int) -> np.ndarray:
     start += np.where(uncorrected, number(40, "i4"), 0) * 100_000
     factor, multiplier = number(32, "i2"), number(34, "i2")
     with np.errstate(divide="ignore", invalid="ignore"):
-        rate = np.where(factor > 0, factor, -1 / factor) * np.where(multiplier > 0, multiplier, -1 / multiplier)
+        rate = np.where(factor > 0, factor, -1 / factor) * np.where(
+            multiplier > 0, multiplier, -1 / multiplier
+        )
     textual = np.zeros(len(raw), bool)
     position = number(46, "u2")
     for _ in range(8):

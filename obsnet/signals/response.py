@@ -1,7 +1,7 @@
 """Complex response of one channel, counts per pascal or per metre a second, from its StationXML stages.
 
-Evaluated here rather than by obspy's evalresp, whose import alone costs more than a station-day of spectra; the tests hold
-the two together. Only response lists, which carry no formula, are still handed to evalresp.
+Evaluated here rather than by obspy's evalresp, whose import alone costs more than a station-day of spectra;
+the tests hold the two together. Only response lists, which carry no formula, are still handed to evalresp.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def frequency_response(response: Any, frequency: np.ndarray, kind: str, name: st
     if any(type(stage).__name__ == "ResponseListResponseStage" for stage in response.response_stages):
         total = _evalresp(response, frequency, name)
     else:
-        total = _sensitivity(response)
+        total = np.full(frequency.size, _sensitivity(response))
         for stage in response.response_stages:
             total = total * _stage(stage, frequency, name)
-    return np.broadcast_to(total, frequency.shape) * _unit_factor(unit, kind, frequency, name)
+    return total * _unit_factor(unit, kind, frequency, name)
 
 
 def described(response: Any) -> bool:
@@ -126,7 +126,7 @@ def _poles_zeros(stage: Any, frequency: np.ndarray, name: str) -> np.ndarray:
 
 
 def _moved_normalisation(stage: Any, name: str) -> float:
-    """Factor that makes the gain hold at the gain's own frequency, where A0 was stated at another (as evalresp does)."""
+    """Factor that makes the gain hold at its frequency where A0 was stated at another, as evalresp does."""
     at, gain_at = stage.normalization_frequency, stage.stage_gain_frequency
     if not gain_at or at is None or float(at) == float(gain_at):
         return 1.0
@@ -142,7 +142,7 @@ def _fir(stage: Any, frequency: np.ndarray, name: str) -> np.ndarray:
 
 
 def _finite_impulse(coefficients: np.ndarray, stage: Any, frequency: np.ndarray, name: str) -> np.ndarray:
-    """FIR normalised at 0 Hz: of zero phase where symmetric, else advanced by the correction that was applied."""
+    """FIR normalised at 0 Hz: of zero phase where symmetric, else advanced by the applied correction."""
     if coefficients.size == 0:
         return np.ones(frequency.size, complex)
     rate = _input_rate(stage, name)

@@ -1,14 +1,16 @@
-"""Waveforms in, short-time spectra out: pressure and velocity in physical units, east, north and down, on a UTC grid.
+"""Waveforms in, short-time spectra out: pressure, and velocity east, north and down, on a UTC grid.
 
-One definition serves every sampling rate. A frame is a span of `window_s` seconds; its value at f_k = k / window_s is
+One definition serves every sampling rate. A frame is a span of `window_s` seconds; its value at f_k = k /
+window_s is
 
     S(f_k) = 2 / Σw · Σ_n w(t_n) (x_n − mean) exp(−2πi f_k t_n) / R(f_k),   w(t) = sin²(πt / window_s),
 
-with t_n the samples' own times after the frame's start and R the channel's response, so that a tone of amplitude A gives
-|S| = A. Rates above the analysis rate are not decimated: their longer FFT is cut at half the analysis rate, which is a
-filter without a transition band, and leaves the bins below it as a station at the analysis rate would have them. At 50,
-62.5, 100, 125, 200, 250 Hz the sum is an FFT; at a rate that gives no whole number of samples it is a chirp-z transform.
-A start off the sampling grid, or a drifting clock, is a phase: frames take the nearest samples and turn it back.
+with t_n the samples' own times after the frame's start and R the channel's response, so that a tone of
+amplitude A gives |S| = A. Rates above the analysis rate are not decimated: their longer FFT is cut at half
+the analysis rate, which is a filter without a transition band, and leaves the bins below it as a station at
+the analysis rate would have them. At 50, 62.5, 100, 125, 200, 250 Hz the sum is an FFT; at a rate that
+gives no whole number of samples it is a chirp-z transform. A start off the sampling grid, or a drifting
+clock, is a phase: frames take the nearest samples and turn it back.
 """
 
 from __future__ import annotations
@@ -19,11 +21,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.fft
 import xarray as xr
 
 from obsnet.errors import ConfigError, StationError, WaveformError
 from obsnet.layout import iso
+from obsnet.signals.frames import FrameTransform, clipped, constant, touched
 from obsnet.signals.response import described, frequency_response
 from obsnet.signals.station import Channel, Station
 from obsnet.signals.timeline import Run
@@ -31,9 +33,7 @@ from obsnet.signals.waveforms import WaveformSource, open_waveforms
 
 _SECOND = 1_000_000_000
 _BATCH = 64
-_GRID_TOLERANCE = 1e-4
 _DELAY_TOLERANCE_S = 1e-7
-_MIN_STEPS = 32
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ def spectra(
     Returns
     -------
     Dataset
-        p [Pa], east, north, down [m/s], those that the channels allow; complex64, dims (frequency [Hz], time); NaN where a
-        frame touches a gap, a dead or a clipped stretch. `time` is the centre of the frame. A tone of amplitude A has modulus A.
-        A channel that is missing throughout is left out.
+        p [Pa], east, north, down [m/s], those that the channels allow; complex64, dims (frequency [Hz],
+        time); NaN where a frame touches a gap, a dead or a clipped stretch. `time` is the centre of the
+        frame. A tone of amplitude A has modulus A. A channel that is missing throughout is left out.
 
     Raises
     ------
@@ -180,7 +180,7 @@ class _FrontEnd:
     def __init__(self, source: WaveformSource, config: SpectraConfig, first: int, last: int) -> None:
         self.source, self.config, self.frequency = source, config, config.frequency
         self._inverses: dict[Channel, np.ndarray] = {}
-        self._transforms: dict[float, _Transform] = {}
+        self._transforms: dict[float, FrameTransform] = {}
         edges = {t for c in source.station.epochs for t in (c.starttime, c.endtime) if math.isfinite(t)}
         self._edges = np.sort(np.array([round(t * _SECOND) for t in edges], np.int64))
         centres = np.array([first, last - 1]) * config.hop_ns + config.window_ns // 2
@@ -250,7 +250,6 @@ class _FrontEnd:
         """Spectra (frame, frequency) of one channel in its own direction, in Pa or m/s."""
         out = np.full((starts.size, self.frequency.size), np.complex64(complex(np.nan, np.nan)))
         timeline = self.source.timelines[channel.seed_id]
-        middle = self.config.window_ns // 2
         for run in timeline.between(
             int(starts[0]) - _SECOND, int(starts[-1]) + self.config.window_ns + _SECOND
         ):
@@ -259,8 +258,7 @@ class _FrontEnd:
             whole = np.flatnonzero((position >= 0) & (position + transform.count <= run.length))
             if whole.size:
                 position = position[whole]
-                delay = run.delay(position + transform.count // 2, starts[whole] + middle)
-                delay -= transform.count // 2 / run.rate - self.config.window_s / 2
+                delay = run.delay(position + transform.count // 2, starts[whole]) - transform.middle_s
                 self._fill(out, whole, run, position, delay, channel, transform)
         return out
 
@@ -272,7 +270,7 @@ class _FrontEnd:
         position: np.ndarray,
         delay: np.ndarray,
         channel: Channel,
-        transform: _Transform,
+        transform: FrameTransform,
     ) -> None:
         """Transform the frames that start at `position` in `run` into `out[rows]`."""
         count, still = transform.count, max(round(self.config.dead_s * run.rate), 2)
@@ -282,20 +280,20 @@ class _FrontEnd:
         )
         samples = run.read(low, high)
         position = position - low
-        dead = _touches(_still(samples, still), position, count)
+        dead = touched(constant(samples, still), position, count)
         views = np.lib.stride_tricks.sliding_window_view(samples, count)
         factor = (self._inverse(channel) * transform.scale).astype(np.complex64)
-        clipped = np.zeros(rows.size, bool)
+        stuck = np.zeros(rows.size, bool)
         for batch in range(0, rows.size, _BATCH):
             chosen = slice(batch, batch + _BATCH)
             cut = views[position[chosen]].astype(np.float64)
-            clipped[chosen] = _clipped(cut, self.config.clip_share)
+            stuck[chosen] = clipped(cut, self.config.clip_share)
             out[rows[chosen]] = transform(cut) * factor * self._turn(delay[chosen])
-        out[rows[dead | clipped]] = complex(np.nan, np.nan)
+        out[rows[dead | stuck]] = complex(np.nan, np.nan)
         report = self.source.report.channels.get(channel.seed_id)
         if report is not None:
             report.dead_frames += int(dead.sum())
-            report.clipped_frames += int((clipped & ~dead).sum())
+            report.clipped_frames += int((stuck & ~dead).sum())
 
     def _turn(self, delay: np.ndarray) -> np.ndarray | np.complex64:
         """Phase that undoes the lateness [s] of the samples, one row a frame."""
@@ -304,10 +302,10 @@ class _FrontEnd:
         distinct = delay[:1] if np.ptp(delay) < _DELAY_TOLERANCE_S else delay
         return np.exp(-2j * np.pi * distinct[:, None] * self.frequency).astype(np.complex64)
 
-    def _transform(self, rate: float) -> _Transform:
+    def _transform(self, rate: float) -> FrameTransform:
         key = round(rate, 4)
         if key not in self._transforms:
-            self._transforms[key] = _Transform(rate, self.config)
+            self._transforms[key] = FrameTransform(rate, self.config.window_s, self.frequency.size)
         return self._transforms[key]
 
     def _inverse(self, channel: Channel) -> np.ndarray:
@@ -324,54 +322,6 @@ class _FrontEnd:
         return self._inverses[channel]
 
 
-class _Transform:
-    """Windowed Fourier transform of frames at one sampling rate, at the frequencies of the analysis.
-
-    Attributes
-    ----------
-    count : int
-        Samples a frame.
-    scale : ndarray
-        Factor at each frequency that makes the modulus the amplitude of a tone.
-    """
-
-    def __init__(self, rate: float, config: SpectraConfig) -> None:
-        self.bins = config.frequency.size
-        exact = rate * config.window_s
-        self.count = round(exact)
-        self._chirp = abs(exact / self.count - 1) > _GRID_TOLERANCE
-        if self._chirp:
-            self.count = math.ceil(exact)
-        period = exact if self._chirp else self.count
-        window = np.sin(np.pi * np.arange(self.count) / period) ** 2
-        self.window = window.astype(np.float32)
-        self.scale = np.full(self.bins, 2 / window.sum())
-        self.scale[0] /= 2
-        if self.count == 2 * (self.bins - 1):
-            self.scale[-1] /= 2
-        if self._chirp:
-            n = np.arange(max(self.count, self.bins))
-            quadratic = np.exp(-1j * np.pi * (n.astype(float) ** 2 / period % 2))
-            self._up, self._down = quadratic[: self.count], quadratic[: self.bins]
-            self._size = scipy.fft.next_fast_len(self.count + self.bins - 1)
-            kernel = np.zeros(self._size, complex)
-            kernel[: self.bins] = np.conj(quadratic[: self.bins])
-            kernel[-(self.count - 1) :] = np.conj(quadratic[self.count - 1 : 0 : -1])
-            self._kernel = scipy.fft.fft(kernel)
-
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Spectra (frame, bin) complex64 of frames (frame, sample), their means removed."""
-        frames -= frames.mean(axis=1, keepdims=True)
-        windowed = np.multiply(frames, self.window, dtype=np.float64).astype(np.float32)
-        if not self._chirp:
-            return scipy.fft.rfft(windowed, axis=1)[:, : self.bins]
-        # Bluestein: kn = (k² + n² − (k − n)²) / 2 turns the sum into a convolution
-        mixed = scipy.fft.fft(windowed * self._up, self._size, axis=1)
-        return (scipy.fft.ifft(mixed * self._kernel, axis=1)[:, : self.bins] * self._down).astype(
-            np.complex64
-        )
-
-
 def _rotation(station: Station, source: WaveformSource) -> dict[str, np.ndarray]:
     """Weights of the motion channels in east, north and down, as far as they determine them."""
     motion = station.motion
@@ -386,9 +336,7 @@ def _rotation(station: Station, source: WaveformSource) -> dict[str, np.ndarray]
         return weights
     for i in flat:
         if motion[i].azimuth_deg is None:
-            raise StationError(
-                f"{motion[i].seed_id} has no azimuth in its StationXML; give the first horizontal's (--orientation)"
-            )
+            raise StationError(f"{motion[i].seed_id} has no azimuth in its StationXML; give --orientation")
     used = flat + steep if len(motion) == 3 else flat
     directions = np.array([motion[i].direction for i in used])[:, : len(used)]
     if abs(np.linalg.det(directions)) < 0.1:
@@ -402,40 +350,3 @@ def _rotation(station: Station, source: WaveformSource) -> dict[str, np.ndarray]
     for name, row in zip(names, inverse, strict=True):
         weights[name][used] = row
     return weights
-
-
-def _still(samples: np.ndarray, count: int) -> np.ndarray:
-    """Which samples lie in a stretch of at least `count` equal ones."""
-    still = np.zeros(samples.size, bool)
-    same = samples[1:] == samples[:-1]
-    if np.count_nonzero(same) < count - 1:
-        return still
-    edges = np.diff(np.concatenate([[0], same.view(np.int8), [0]]))
-    for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        if end - begin >= count - 1:
-            still[begin : end + 1] = True
-    return still
-
-
-def _touches(bad: np.ndarray, position: np.ndarray, count: int) -> np.ndarray:
-    """Which frames of `count` samples contain a bad sample."""
-    if not bad.any():
-        return np.zeros(position.size, bool)
-    before = np.concatenate([[0], np.cumsum(bad)])
-    return before[position + count] > before[position]
-
-
-def _clipped(frames: np.ndarray, share: float) -> np.ndarray:
-    """Which frames stick to their extremes: three samples in a row and more, together `share` of the frame.
-
-    Frames with fewer than 32 distinct values are coarse, not clipped.
-    """
-    top = frames == frames.max(axis=1, keepdims=True)
-    top |= frames == frames.min(axis=1, keepdims=True)
-    suspect = np.flatnonzero(np.count_nonzero(top, axis=1) >= share * frames.shape[1])
-    clipped = np.zeros(len(frames), bool)
-    for row in suspect:
-        stuck = top[row, 2:] & (np.diff(frames[row])[1:] == 0) & (np.diff(frames[row])[:-1] == 0)
-        enough = np.count_nonzero(stuck) >= share * frames.shape[1]
-        clipped[row] = enough and np.unique(frames[row]).size >= _MIN_STEPS
-    return clipped

@@ -1,24 +1,24 @@
 """StationXML in, `Station` out: position, depth, and for every channel its direction, polarity and response.
 
-Which channels are used. A motion channel has a motion instrument code and any orientation code; a pressure channel has
-instrument code D or orientation code H. Among the channels at hand (`Station.at`), the motion group (one location, band
-and instrument) with the most components wins, then the lowest sampling rate, then the lowest location code; the pressure
-channel is taken from the same location and band where there is one, hydrophones (H) before gauges (G), else the nearest.
+Which channels are used. A motion channel has a motion instrument code (H, L, N, G, P, M); a pressure
+channel has instrument code D or orientation code H. Among the channels at hand (`Station.at`), the motion
+sensor (one location, band and instrument) with the most components wins, then the lowest sampling rate,
+then the lowest location code. The pressure channel comes from the same location and band if it can, a
+hydrophone (H) before a gauge (F, G).
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from obsnet.errors import StationError
 from obsnet.layout import iso
+from obsnet.signals import inventory as inventories
 
 _MOTION_INSTRUMENTS = "HLNGPM"
 _PAIRS = ("NE", "12", "XY", "23", "13", "TR", "UV", "AB")
@@ -104,7 +104,7 @@ class Station:
     depth_m : float
         Depth of the sea floor below the surface, positive.
     channels : tuple of Channel
-        The channels in use: at most one pressure channel and one motion sensor (the module says how they are chosen).
+        The channels in use: at most one pressure channel and one motion sensor; the module says how chosen.
     epochs : tuple of Channel
         Every usable channel of every epoch, location and band; what `at` chooses from.
 
@@ -124,12 +124,11 @@ class Station:
 
     def __post_init__(self) -> None:
         if not (-90 <= self.latitude <= 90 and -180 <= self.longitude <= 360):
-            raise StationError(
-                f"{self.code} lies at latitude {self.latitude}, longitude {self.longitude}; correct its position"
-            )
+            where = f"latitude {self.latitude}, longitude {self.longitude}"
+            raise StationError(f"{self.code} cannot lie at {where}; correct its position")
         if not (math.isfinite(self.depth_m) and 0 < self.depth_m < 12000):
             raise StationError(
-                f"the depth of {self.code} would be {self.depth_m:g} m (minus its elevation); give its depth (--depth)"
+                f"{self.code} cannot have a depth of {self.depth_m:g} m; give its depth (--depth)"
             )
         if not self.epochs:
             object.__setattr__(self, "epochs", self.channels)
@@ -156,10 +155,11 @@ class Station:
         code : str, optional
             "NET.STA" (or "STA" where that is unique); may be left out if there is only one station.
         time : datetime64, ISO text or UTCDateTime, optional
-            Keep only the epochs in force at this time. By default all are kept and the waveforms' times decide.
+            Keep only the epochs in force at this time. By default the times of the waveforms decide.
         orientation_deg : float, optional
-            Azimuth of the first horizontal (N, 1, X, else the lower code), overriding the metadata. The others keep their angle
-            to it; where the metadata give none, the second is 90° clockwise of the first.
+            Azimuth of the first horizontal (N, 1, X, else the lower code), overriding the metadata. The
+            others keep their angle to it; where the metadata give none, the second is 90° clockwise of the
+            first.
         hydrophone_polarity : {1, -1}, optional
             -1 if a compression makes the hydrophone, corrected for its response, go down.
         latitude, longitude, depth_m : float, optional
@@ -170,20 +170,16 @@ class Station:
         StationError
             Unreadable metadata, another station, no usable channel, no epoch at `time`, no depth.
 
-        Notes
-        -----
-        The polarity of a pressure channel is the sign of its response; its dip is not used, since instrument parks disagree
-        on what it means.
+        Notes ----- The polarity of a pressure channel is the sign of its response; its dip is not used,
+        since instrument parks disagree on what it means.
         """
-        inventory = _read(source)
-        station, network, name = _find(
-            inventory, code, "the inventory" if not isinstance(source, (str, Path)) else str(source)
-        )
+        where = inventories.describe(source)
+        station, network, name = inventories.find(inventories.read(source), code, where)
         full = f"{network}.{name}"
         epochs = tuple(channel for item in station for channel in _channels(item, full))
         if not epochs:
             raise StationError(
-                f"{full} has no hydrophone and no motion channel in {_describe(source)}; check its channel codes"
+                f"{where} has no hydrophone and no motion channel of {full}; check its channel codes"
             )
         if time is not None:
             epochs = _in_force(epochs, time, full)
@@ -192,7 +188,7 @@ class Station:
             full,
             float(last.latitude if latitude is None else latitude),
             float(last.longitude if longitude is None else longitude),
-            _depth(last, full) if depth_m is None else float(depth_m),
+            inventories.depth_m(last, full) if depth_m is None else float(depth_m),
             epochs=epochs,
         )
         return made.calibrated(orientation_deg=orientation_deg, hydrophone_polarity=hydrophone_polarity).at()
@@ -268,61 +264,6 @@ class Station:
         )
 
 
-def _describe(source: Any) -> str:
-    return str(source) if isinstance(source, (str, Path)) else "the inventory"
-
-
-def _read(source: Any) -> Any:
-    """Parse StationXML without entities, networks or half-read files."""
-    if not isinstance(source, (str, Path)):
-        if hasattr(source, "networks"):
-            return source
-        raise StationError(
-            f"a station needs a StationXML path or an obspy Inventory, found a {type(source).__name__}"
-        )
-    from io import BytesIO
-
-    import obspy
-
-    try:
-        content = Path(source).read_bytes()
-    except OSError as error:
-        raise StationError(f"cannot read the StationXML {source}: {error.strerror}") from None
-    if not content.strip():
-        raise StationError(f"the StationXML {source} is empty")
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise StationError(
-            f"the StationXML {source} declares entities, which StationXML has no use for; remove them"
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return obspy.read_inventory(BytesIO(content), format="STATIONXML")
-        except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
-            detail = " ".join(str(error).split())[:120] or type(error).__name__
-            raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None
-
-
-def _find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, str]:
-    """All epochs (in order of start) of the one station asked for."""
-    found: dict[tuple[str, str], list[Any]] = {}
-    for network in inventory.networks:
-        for station in network.stations:
-            found.setdefault((network.code, station.code), []).append(station)
-    names = ", ".join(f"{net}.{sta}" for net, sta in found) or "none"
-    if len(names) > 200:
-        names = names[:200].rpartition(",")[0] + ", …"
-    wanted = [key for key in found if code is None or code in (key[1], ".".join(key))]
-    if not wanted:
-        raise StationError(
-            f"{where} does not describe {code}; it has {names}" if found else f"{where} describes no station"
-        )
-    if len(wanted) > 1:
-        raise StationError(f"{where} describes {len(found)} stations; name one of {names}")
-    network, name = wanted[0]
-    return sorted(found[wanted[0]], key=lambda item: _seconds(item.start_date, -math.inf)), network, name
-
-
 def _channels(station: Any, full: str) -> list[Channel]:
     made = []
     for item in station.channels:
@@ -342,32 +283,21 @@ def _channels(station: Any, full: str) -> list[Channel]:
                 1,
                 item.response,
                 float(item.sample_rate or 0.0),
-                _seconds(item.start_date, -math.inf),
-                _seconds(item.end_date, math.inf),
+                inventories.seconds(item.start_date, -math.inf),
+                inventories.seconds(item.end_date, math.inf),
             )
         )
     return made
 
 
 def _in_force(epochs: tuple[Channel, ...], time: Any, full: str) -> tuple[Channel, ...]:
-    stamp = _seconds(time, 0.0)
+    stamp = inventories.seconds(time, 0.0)
     kept = tuple(channel for channel in epochs if channel.covers(stamp))
     if not kept:
         begin, end = min(c.starttime for c in epochs), max(c.endtime for c in epochs)
         span = " to ".join(iso(edge) if math.isfinite(edge) else "now" for edge in (begin, end))
         raise StationError(f"no channel of {full} has an epoch at {iso(stamp)}; its epochs span {span}")
     return kept
-
-
-def _depth(station: Any, full: str) -> float:
-    elevation = station.elevation
-    if elevation is None:
-        raise StationError(f"{full} has no elevation in its StationXML; give its depth (--depth)")
-    if float(elevation) >= 0:
-        raise StationError(
-            f"{full} has an elevation of {float(elevation):g} m, but the sea floor lies below 0; give its depth (--depth)"
-        )
-    return -float(elevation)
 
 
 def _choose_motion(channels: list[Channel]) -> tuple[Channel, ...]:
@@ -426,17 +356,3 @@ def _turned(channel: Channel, epochs: tuple[Channel, ...], orientation_deg: floa
 
 def _overlap(first: Channel, second: Channel) -> bool:
     return first.starttime < second.endtime and second.starttime < first.endtime
-
-
-def _seconds(time: Any, default: float) -> float:
-    if time is None:
-        return default
-    if hasattr(time, "timestamp") and not callable(time.timestamp):
-        return float(time.timestamp)
-    try:
-        text = time.rstrip("Z") if isinstance(time, str) else time
-        return float(np.datetime64(text, "ns").astype("int64")) / 1e9
-    except (ValueError, TypeError):
-        raise StationError(
-            f"cannot read the time {time!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
-        ) from None

@@ -1,8 +1,9 @@
 """Pieces of waveform in, runs of continuous samples out, each sample with its own time.
 
-A piece is what one file holds without a break. Pieces that join within half a sample make a run; a later piece that
-overlaps an earlier one gives way. Nothing is resampled: a sample's time is that of its piece or record, so that neither a
-start off the sampling grid nor a clock that runs at 49.9987 Hz shifts anything downstream.
+A piece is what one file holds without a break. Pieces that join within half a sample make a run; a later
+piece that overlaps an earlier one gives way. Nothing is resampled: a sample's time is that of its piece or
+record, so that neither a start off the sampling grid nor a clock that runs at 49.9987 Hz shifts anything
+downstream.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Piece:
     rate : float
         True sampling rate, Hz.
     knots : tuple of two arrays, optional
-        Sample indices and their times in s after the start, where records follow a clock that no single rate describes.
+        Sample indices and their times in s after the start, where records follow a clock that no single
+        rate describes.
     first, last : int
         The samples kept, when overlaps with other pieces are cut off; `last` is exclusive, -1 for all.
     """
@@ -149,8 +151,8 @@ class Timeline:
     ----------
     runs : list of Run
     overlaps : list of Overlap
-        What was cut off: of two pieces that cover the same time, the one that starts first (the longer, if both start
-        together) is kept.
+        What was cut off: of two pieces that cover the same time, the one that starts first (the longer, if
+        both start together) is kept.
     """
 
     def __init__(self, pieces: Iterable[Piece]) -> None:

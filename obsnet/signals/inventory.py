@@ -1,0 +1,93 @@
+"""StationXML in, the obspy description of one station out: parsing and look-up, with errors of one line."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import obspy
+
+from obsnet.errors import StationError
+
+
+def describe(source: Any) -> str:
+    """How a message names the source."""
+    return str(source) if isinstance(source, (str, Path)) else "the inventory"
+
+
+def read(source: Any) -> Any:
+    """Parse StationXML without entities, networks or half-read files."""
+    if not isinstance(source, (str, Path)):
+        if hasattr(source, "networks"):
+            return source
+        raise StationError(
+            f"a station needs a StationXML path or an obspy Inventory, found a {type(source).__name__}"
+        )
+    try:
+        content = Path(source).read_bytes()
+    except OSError as error:
+        raise StationError(f"cannot read the StationXML {source}: {error.strerror}") from None
+    if not content.strip():
+        raise StationError(f"the StationXML {source} is empty")
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise StationError(
+            f"the StationXML {source} declares entities, which StationXML has no use for; remove them"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return obspy.read_inventory(BytesIO(content), format="STATIONXML")
+        except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
+            detail = " ".join(str(error).split())[:120] or type(error).__name__
+            raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None
+
+
+def find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, str]:
+    """All epochs (in order of start) of the one station asked for."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for network in inventory.networks:
+        for station in network.stations:
+            found.setdefault((network.code, station.code), []).append(station)
+    names = ", ".join(f"{net}.{sta}" for net, sta in found) or "none"
+    if len(names) > 200:
+        names = names[:200].rpartition(",")[0] + ", …"
+    wanted = [key for key in found if code is None or code in (key[1], ".".join(key))]
+    if not wanted:
+        raise StationError(
+            f"{where} describes no station" if not found else f"{where} has {names}, not {code}"
+        )
+    if len(wanted) > 1:
+        raise StationError(f"{where} describes {len(wanted)} stations; name one of {names}")
+    network, name = wanted[0]
+    return sorted(found[wanted[0]], key=lambda item: seconds(item.start_date, -math.inf)), network, name
+
+
+def depth_m(station: Any, full: str) -> float:
+    """Depth of the sea floor: minus the elevation."""
+    if station.elevation is None:
+        raise StationError(f"{full} has no elevation in its StationXML; give its depth (--depth)")
+    elevation = float(station.elevation)
+    if elevation >= 0:
+        raise StationError(
+            f"{full} has an elevation of {elevation:g} m, not below 0; give its depth (--depth)"
+        )
+    return -elevation
+
+
+def seconds(time: Any, default: float) -> float:
+    """Seconds since 1970 of a UTCDateTime, datetime64 or ISO text; `default` for None."""
+    if time is None:
+        return default
+    if hasattr(time, "timestamp") and not callable(time.timestamp):
+        return float(time.timestamp)
+    try:
+        text = time.rstrip("Z") if isinstance(time, str) else time
+        return float(np.datetime64(text, "ns").astype("int64")) / 1e9
+    except (ValueError, TypeError):
+        raise StationError(
+            f"cannot read the time {time!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
+        ) from None
