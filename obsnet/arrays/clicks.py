@@ -178,11 +178,11 @@ def process(
     groups = coincidences(arrivals(recording, detector), within, least)
     pairs = geometry.pairs(config.every_pair)
     timed = [_timed(recording, geometry, pairs, group, config) for group in groups]
-    timed = sorted((click for click in timed if click is not None), key=lambda click: click[0])
-    time = np.array([click[0] for click in timed])
-    tdoa = np.array([click[1] for click in timed]).reshape(-1, len(pairs))
-    coefficient = np.array([click[2] for click in timed]).reshape(-1, len(pairs))
-    covariance = np.array([click[3] for click in timed]).reshape(-1, len(pairs), len(pairs))
+    clicks = sorted((click for click in timed if click is not None), key=lambda click: click.time)
+    size = len(pairs)
+    time = np.array([click.time for click in clicks])
+    tdoa = np.array([click.tdoa for click in clicks]).reshape(-1, size)
+    covariance = np.array([click.covariance for click in clicks]).reshape(-1, size, size)
     found = directions(tdoa, geometry, pairs, covariance, config.false_rejection)
     return ClickRecord(
         array=geometry,
@@ -191,17 +191,26 @@ def process(
         end=starttime + recording.duration_s,
         time=time + starttime,
         tdoa=tdoa,
-        coefficient=coefficient,
+        coefficient=np.array([click.coefficient for click in clicks]).reshape(-1, size),
         tdoa_covariance=covariance,
-        snr_db=np.array([click[4] for click in timed]),
+        snr_db=np.array([click.snr_db for click in clicks]),
         directions=found,
         echoes=_echoes(time, found, geometry, config),
     )
 
 
+@dataclass(frozen=True)
+class _TimedClick:
+    time: float
+    tdoa: np.ndarray
+    coefficient: np.ndarray
+    covariance: np.ndarray
+    snr_db: float
+
+
 def _timed(
     recording: Recording, array: CompactArray, pairs: np.ndarray, group: list[Arrival], config: ClickConfig
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, float] | None:
+) -> _TimedClick | None:
     """Time, TDOAs, correlation coefficients, covariance and SNR of one click; None where it cannot be
     correlated.
     """
@@ -221,7 +230,7 @@ def _timed(
     shared, own = tdoa_variance(coefficient, segments.shape[1] / rate, bands)
     own += ((1.0 / np.sqrt(12.0) if config.interpolation == "none" else 0.05) / rate) ** 2
     covariance = array.tdoa_covariance(pairs, np.sqrt(shared + config.timing_std_s**2), np.sqrt(own))
-    return time, tdoa, coefficient, covariance, max(arrival.snr_db for arrival in group)
+    return _TimedClick(time, tdoa, coefficient, covariance, max(arrival.snr_db for arrival in group))
 
 
 def _bands(group: list[Arrival], octaves: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -235,8 +244,8 @@ def _bands(group: list[Arrival], octaves: list[tuple[float, float]]) -> list[tup
 
 def _echoes(time: np.ndarray, found: Directions, array: CompactArray, config: ClickConfig) -> EchoRanges:
     """Surface echoes among the accepted clicks, over all clicks."""
-    blank = [np.full(len(time), np.nan) for _ in range(4)]
-    nothing = EchoRanges(*blank, echo_of=np.full(len(time), -1))
+    delay, distance, spread, depth = (np.full(len(time), np.nan) for _ in range(4))
+    nothing = EchoRanges(delay, distance, spread, depth, np.full(len(time), -1))
     chosen = np.flatnonzero(found.accepted)
     if not config.echoes or array.mean_depth_m <= 0 or not len(chosen):
         return nothing

@@ -119,7 +119,7 @@ class Recording:
         """Samples [start, stop) as (hydrophone, time), full scale 1; zero beyond the ends, NaN where not a
         number.
         """
-        inside = np.asarray(self.raw[max(start, 0) : max(stop, 0)], dtype)
+        inside: np.ndarray = np.asarray(self.raw[max(start, 0) : max(stop, 0)], dtype)
         scaled = (inside - dtype(self.midpoint)) / dtype(self.full_scale)
         scaled[~np.isfinite(scaled)] = np.nan
         before = min(max(-start, 0), stop - start)
