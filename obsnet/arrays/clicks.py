@@ -23,8 +23,9 @@ from obsnet.arrays.click_detector import Arrival, DetectorConfig, arrivals, coin
 from obsnet.arrays.click_map import ClickMapConfig, azimuth_map
 from obsnet.arrays.compact import CompactArray
 from obsnet.arrays.echo import EchoRanges, echo_range, surface_echoes
+from obsnet.arrays.joint_tdoa import joint_tdoa
 from obsnet.arrays.recording import Recording, read_wav
-from obsnet.arrays.tdoa import Interpolation, cross_correlation_tdoa, tdoa_variance
+from obsnet.arrays.tdoa import Interpolation, cross_correlations, highest_tdoa, tdoa_variance
 from obsnet.errors import ConfigError, WaveformError
 
 __all__ = [
@@ -38,6 +39,9 @@ __all__ = [
     "process",
     "read_wav",
 ]
+
+SECOND_GATE = 0.2
+"""Right clicks that the χ² gate may refuse among those tried again: many tries call for a narrower gate."""
 
 
 @dataclass(frozen=True)
@@ -211,26 +215,45 @@ class _TimedClick:
 def _timed(
     recording: Recording, array: CompactArray, pairs: np.ndarray, group: list[Arrival], config: ClickConfig
 ) -> _TimedClick | None:
-    """Time, TDOAs, correlation coefficients, covariance and SNR of one click; None where it cannot be
-    correlated.
+    """TDOAs of one click and their covariance; None where it cannot be correlated.
+
+    Where the pairs' highest peaks do not fit one direction, those that do are sought (`joint_tdoa`).
     """
     rate = recording.sampling_rate
     time = float(np.mean([arrival.time for arrival in group]))
-    reach = np.asarray(array.travel(pairs))
+    reach = array.travel(pairs) * 1.02 + 1.0 / rate
     half = int(np.ceil((config.click_s / 2.0 + reach.max()) * rate))
     centre = round(time * rate)
     segments = recording.segment(centre - half, centre + half + 1)
     segments = segments * tukey(segments.shape[1], 0.2)
     bands = _bands(group, config.detector.octaves(rate))
-    tdoa, coefficient = cross_correlation_tdoa(
-        segments, rate, pairs, reach * 1.02 + 1.0 / rate, bands, config.interpolation
-    )
+    duration = segments.shape[1] / rate
+    correlation, lag_rate = cross_correlations(segments, rate, pairs, reach, bands, config.interpolation)
+    tdoa, coefficient = highest_tdoa(correlation, lag_rate, config.interpolation)
     if not np.isfinite(tdoa).any():
         return None
-    shared, own = tdoa_variance(coefficient, segments.shape[1] / rate, bands)
-    own += ((1.0 / np.sqrt(12.0) if config.interpolation == "none" else 0.05) / rate) ** 2
-    covariance = array.tdoa_covariance(pairs, np.sqrt(shared + config.timing_std_s**2), np.sqrt(own))
+    covariance = _covariance(array, pairs, coefficient, duration, bands, rate, config)
+    if not directions(tdoa, array, pairs, covariance, config.false_rejection).accepted[0]:
+        again = joint_tdoa(correlation, lag_rate, array, pairs, covariance, config.interpolation)
+        spread = _covariance(array, pairs, again[1], duration, bands, rate, config)
+        if directions(again[0], array, pairs, spread, SECOND_GATE).accepted[0]:
+            (tdoa, coefficient), covariance = again, spread
     return _TimedClick(time, tdoa, coefficient, covariance, max(arrival.snr_db for arrival in group))
+
+
+def _covariance(
+    array: CompactArray,
+    pairs: np.ndarray,
+    coefficient: np.ndarray,
+    duration_s: float,
+    bands: list[tuple[float, float]],
+    sampling_rate: float,
+    config: ClickConfig,
+) -> np.ndarray:
+    """Covariance of a click's TDOAs: its noise, the channels' timing, and what is left of the sampling."""
+    shared, own = tdoa_variance(coefficient, duration_s, bands)
+    own += ((1.0 / np.sqrt(12.0) if config.interpolation == "none" else 0.05) / sampling_rate) ** 2
+    return array.tdoa_covariance(pairs, float(np.sqrt(shared + config.timing_std_s**2)), float(np.sqrt(own)))
 
 
 def _bands(group: list[Arrival], octaves: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -44,27 +44,64 @@ def cross_correlation_tdoa(
     tdoa : array (pair,), t_i − t_j in s; NaN where a hydrophone is silent or has a gap.
     coefficient : array (pair,), −1 to 1.
     """
+    correlation, rate = cross_correlations(segments, sampling_rate, pairs, max_tdoa_s, band_hz, interpolation)
+    return highest_tdoa(correlation, rate, interpolation)
+
+
+def highest_tdoa(
+    correlation: np.ndarray, rate: float, interpolation: Interpolation = "upsampled"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lag [s] and height of each pair's highest peak; NaN where there is no correlation."""
+    tdoa, coefficient = np.full(len(correlation), np.nan), np.full(len(correlation), np.nan)
+    for row, values in enumerate(correlation):
+        if np.isfinite(values).any():
+            tdoa[row], coefficient[row] = peak(values, int(np.nanargmax(values)), rate, interpolation)
+    return tdoa, coefficient
+
+
+def cross_correlations(
+    segments: np.ndarray,
+    sampling_rate: float,
+    pairs: np.ndarray,
+    max_tdoa_s: np.ndarray,
+    band_hz: list[tuple[float, float]] | None = None,
+    interpolation: Interpolation = "upsampled",
+) -> tuple[np.ndarray, float]:
+    """Correlation coefficients against lag, dims (pair, lag), and the rate [Hz] of the lags.
+
+    Lag zero is in the middle; lags beyond a pair's `max_tdoa_s` are NaN, as are pairs with a silent
+    hydrophone.
+    """
     segments = np.asarray(segments, float)
     if segments.ndim != 2 or segments.shape[1] < 4:
         raise LayoutError(f"segments must have dims (hydrophone, time), found shape {segments.shape}")
     factor = _factor(interpolation)
-    spectra, size = _spectra(segments, sampling_rate, np.max(max_tdoa_s), band_hz)
+    limit = np.broadcast_to(np.asarray(max_tdoa_s, float), (len(pairs),))
+    spectra, size = _spectra(segments, sampling_rate, float(limit.max()), band_hz)
     energy = np.sqrt((np.abs(spectra) ** 2).sum(axis=1))
-    pairs = np.asarray(pairs)
-    tdoa, coefficient = np.full(len(pairs), np.nan), np.full(len(pairs), np.nan)
     rate = sampling_rate * factor
-    for row, (i, j) in enumerate(pairs):
+    reach = np.ceil(limit * rate).astype(int)
+    widest = int(reach.max())
+    correlation = np.full((len(pairs), 2 * widest + 1), np.nan)
+    for row, (i, j) in enumerate(np.asarray(pairs)):
         norm = energy[i] * energy[j]
         if not (np.isfinite(norm) and norm > 0):
             continue
         cross = irfft(spectra[i] * np.conj(spectra[j]), size * factor) * (size * factor / 2.0) / norm
-        reach = int(np.ceil(max_tdoa_s[row] * rate)) + factor
-        window = np.concatenate([cross[-reach:], cross[: reach + 1]])
-        peak = int(window[1:-1].argmax()) + 1
-        shift, height = _vertex(window[peak - 1 : peak + 2])
-        tdoa[row] = (peak - reach + (0.0 if interpolation == "none" else shift)) / rate
-        coefficient[row] = window[peak] if interpolation == "none" else height
-    return tdoa, coefficient
+        inside = np.concatenate([cross[-reach[row] :], cross[: reach[row] + 1]])
+        correlation[row, widest - reach[row] : widest + reach[row] + 1] = inside
+    return correlation, rate
+
+
+def peak(
+    correlation: np.ndarray, index: int, rate: float, interpolation: Interpolation = "upsampled"
+) -> tuple[float, float]:
+    """Lag [s] and height of the maximum at `index` of one pair's correlation."""
+    middle = len(correlation) // 2
+    shift, height = 0.0, float(correlation[index])
+    if interpolation != "none" and 0 < index < len(correlation) - 1:
+        shift, height = _vertex(correlation[index - 1 : index + 2])
+    return (index - middle + shift) / rate, height
 
 
 def tdoa_variance(
@@ -122,7 +159,7 @@ def _vertex(values: np.ndarray) -> tuple[float, float]:
     """Offset in points and height of the parabola through three neighbouring values."""
     before, top, after = values
     bend = before - 2.0 * top + after
-    if bend >= 0:
+    if not bend < 0:
         return 0.0, float(top)
     shift = float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
     return shift, float(top - 0.25 * (before - after) * shift)
