@@ -152,7 +152,8 @@ def add_whale(field: Field, first: int, sampling_rate: float, whale: Whale, path
         for i in np.flatnonzero(np.abs(pressure) > 0):
             _add_call(
                 field.pressure, field.east, field.north, field.down, heard[i], late[i], sampling_rate, units,
-                pressure[i], towards[i] * east[i], towards[i] * north[i], arrival.admittance[i], edge, hertz[1],
+                pressure[i], towards[i] * east[i], towards[i] * north[i], arrival.admittance[i], edge,
+                hertz[1],
             )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ FIRST = 68_456_520_123
 
 
 def white(level: float = 1.0):
-    def colour(frequency: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def colour(_frequency: np.ndarray, z: np.ndarray) -> np.ndarray:
         return z * np.float32(np.sqrt(level))
 
     return colour
@@ -16,7 +16,7 @@ def white(level: float = 1.0):
 
 def test_psd_and_gaussianity_of_white_noise():
     noise = gaussian_noise((1,), FIRST, 400_000, 50.0, white(4.0))[0].astype(float)
-    frequency, psd = welch(noise, 50.0, nperseg=1024)
+    _frequency, psd = welch(noise, 50.0, nperseg=1024)
     assert np.mean(psd[5:-5]) == pytest.approx(4.0, rel=0.01)
     assert np.mean(noise**4) / np.mean(noise**2) ** 2 == pytest.approx(3.0, abs=0.05)
 

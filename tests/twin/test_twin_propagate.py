@@ -1,4 +1,6 @@
-"""Propagation is tested against the closed form of an ocean of one sound speed, solved anew here for each sample."""
+"""Propagation is tested against the closed form of an ocean of one sound speed, solved anew here for
+each sample.
+"""
 
 import numpy as np
 import pytest
