@@ -6,6 +6,7 @@ Each command imports what it needs when it runs. Bad input ends in one line on s
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,30 +31,50 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Waveforms = Annotated[list[str], typer.Argument(help="Waveform files, folders or an SDS archive, any format obspy reads.")]
+Waveforms = Annotated[
+    list[str], typer.Argument(help="Waveform files, folders or an SDS archive, any format obspy reads.")
+]
 StationFile = Annotated[Path, typer.Option("--station", help="StationXML of the station.")]
-Code = Annotated[str | None, typer.Option("--code", help="NET.STA, where the StationXML holds several stations.")]
+Code = Annotated[
+    str | None, typer.Option("--code", help="NET.STA, where the StationXML holds several stations.")
+]
 Out = Annotated[Path, typer.Option("--out", help="Output folder.")]
 DetectorName = Annotated[str | None, typer.Option("--detector", help="learned or analytic.")]
 TrackerName = Annotated[str | None, typer.Option("--tracker", help="grid, bernoulli or focalization.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of parameters.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="One parameter, as section.key=value; repeatable.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="One parameter, as section.key=value; repeatable.")
+]
 Start = Annotated[str | None, typer.Option("--start", help="ISO 8601 UTC start.")]
 End = Annotated[str | None, typer.Option("--end", help="ISO 8601 UTC end.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Threads or processes (all cores by default).")]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Threads or processes (all cores by default).")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
 AisFile = Annotated[Path | None, typer.Option("--ais", help="AIS file, overlaid on the report.")]
 CalibrationFile = Annotated[Path | None, typer.Option("--calibration", help="File of `obsnet calibrate`.")]
-Orientation = Annotated[float | None, typer.Option("--orientation", help="Azimuth of the first horizontal [deg].")]
-Polarity = Annotated[int | None, typer.Option("--hydrophone-polarity", help="1, or -1 for a reversed hydrophone.")]
-Depth = Annotated[float | None, typer.Option("--depth", help="Depth of the station [m], over the StationXML's.")]
+Orientation = Annotated[
+    float | None, typer.Option("--orientation", help="Azimuth of the first horizontal [deg].")
+]
+Polarity = Annotated[
+    int | None, typer.Option("--hydrophone-polarity", help="1, or -1 for a reversed hydrophone.")
+]
+Depth = Annotated[
+    float | None, typer.Option("--depth", help="Depth of the station [m], over the StationXML's.")
+]
 Latitude = Annotated[float | None, typer.Option("--latitude", help="Latitude [deg], over the StationXML's.")]
-Longitude = Annotated[float | None, typer.Option("--longitude", help="Longitude [deg], over the StationXML's.")]
-PropagationFile = Annotated[Path | None, typer.Option("--propagation", help="netCDF table of delays, over the configured ocean.")]
+Longitude = Annotated[
+    float | None, typer.Option("--longitude", help="Longitude [deg], over the StationXML's.")
+]
+PropagationFile = Annotated[
+    Path | None, typer.Option("--propagation", help="netCDF table of delays, over the configured ocean.")
+]
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Entry point: run a command, turn expected errors into one line and exit status 2."""
+    # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     command = typer.main.get_command(app)
     try:
         code = command.main(args=arguments, prog_name="obsnet", standalone_mode=False)
@@ -79,7 +100,9 @@ def _fail(message: str) -> NoReturn:
 
 
 @app.command()
-def demo(out: Out = Path("demo-output"), detector: DetectorName = None, jobs: Jobs = None, quiet: Quiet = False) -> None:
+def demo(
+    out: Out = Path("demo-output"), detector: DetectorName = None, jobs: Jobs = None, quiet: Quiet = False
+) -> None:
     """Run the main job on the bundled passage (simulated waveforms) and compare with its AIS."""
     from obsnet.sample import sample_folder
 
@@ -220,7 +243,9 @@ def _evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = Fals
         print(evaluation.table())
 
 
-def _run_config(path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None) -> RunConfig:
+def _run_config(
+    path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None
+) -> RunConfig:
     from obsnet.config import build, merge_overrides, read_yaml
     from obsnet.pipeline import RunConfig
 
@@ -235,7 +260,9 @@ def _run_config(path: Path | None, overrides: list[str] | None, detector: str | 
 def _station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:
     from obsnet.signals.station import Station
 
-    return Station.from_stationxml(path, code, time=start, **{key: value for key, value in overrides.items() if value is not None})
+    return Station.from_stationxml(
+        path, code, time=start, **{key: value for key, value in overrides.items() if value is not None}
+    )
 
 
 def _calibration(path: Path | None) -> Calibration | None:
@@ -291,7 +318,12 @@ def _progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None]
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:3.0f} %"),
+            TimeRemainingColumn(),
+        )
         with Progress(*columns, console=Console(stderr=True)) as bar:
             task = bar.add_task(text, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
@@ -335,7 +367,9 @@ def calibrate(
     result.write(folder / "calibration.yaml")
     if not quiet:
         print(result.table())
-        print(f"written to {folder / 'calibration.yaml'}; use it with: obsnet track … --calibration {folder / 'calibration.yaml'}")
+        print(
+            f"written to {folder / 'calibration.yaml'}; use it with: obsnet track … --calibration {folder / 'calibration.yaml'}"
+        )
 
 
 @app.command()
@@ -345,7 +379,9 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", help="Seed of everything that is drawn.")] = 0,
     ships: Annotated[int, typer.Option("--ships", min=0, help="Ships drawn at random.")] = 1,
     ais: AisFile = None,
-    station: Annotated[Path | None, typer.Option("--station", help="StationXML whose position and depth to use.")] = None,
+    station: Annotated[
+        Path | None, typer.Option("--station", help="StationXML whose position and depth to use.")
+    ] = None,
     start: Start = None,
     quiet: Quiet = False,
 ) -> None:
@@ -353,7 +389,9 @@ def simulate(
     from obsnet.twin.station import simulate_folder
 
     with _progress("simulating", quiet) as progress:
-        summary = simulate_folder(out, hours=hours, seed=seed, ships=ships, ais=ais, station=station, start=start, progress=progress)
+        summary = simulate_folder(
+            out, hours=hours, seed=seed, ships=ships, ais=ais, station=station, start=start, progress=progress
+        )
     if not quiet:
         print(summary)
 
@@ -364,8 +402,12 @@ def fetch(
     start: Annotated[str, typer.Option("--start", help="ISO 8601 UTC start.")],
     end: Annotated[str, typer.Option("--end", help="ISO 8601 UTC end.")],
     out: Out,
-    base_url: Annotated[str | None, typer.Option("--base-url", help="FDSN data centre, by name or address.")] = None,
-    channels: Annotated[str | None, typer.Option("--channels", help="Channel codes, comma separated, wildcards allowed.")] = None,
+    base_url: Annotated[
+        str | None, typer.Option("--base-url", help="FDSN data centre, by name or address.")
+    ] = None,
+    channels: Annotated[
+        str | None, typer.Option("--channels", help="Channel codes, comma separated, wildcards allowed.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Fetch waveforms and metadata from an FDSN data centre into an SDS archive; resumes where it stopped."""
@@ -397,7 +439,6 @@ def reproduce(
 ) -> None:
     """Repeat a paper's experiment; prints its numbers beside obsnet's."""
     import importlib
-    import os
 
     if name not in EXPERIMENTS:
         raise ConfigError(f"no experiment '{name}'; choose one of {', '.join(EXPERIMENTS)}")
@@ -421,7 +462,9 @@ def reproduce(
 @app.command()
 def plot(
     folder: Annotated[Path, typer.Argument(help="Folder of `obsnet track`.")],
-    figure: Annotated[int | None, typer.Option("--figure", help="The core paper's figure 3, 5, 6, 7 or 8 (all by default).")] = None,
+    figure: Annotated[
+        int | None, typer.Option("--figure", help="The core paper's figure 3, 5, 6, 7 or 8 (all by default).")
+    ] = None,
     ais: AisFile = None,
 ) -> None:
     """Draw the core paper's figures from any run."""

@@ -87,7 +87,9 @@ def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str
         merged = OmegaConf.merge(OmegaConf.create(dict(values)), OmegaConf.from_dotlist(overrides))
         plain = OmegaConf.to_container(merged, resolve=True)
     except (OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}") from None
+        raise ConfigError(
+            f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}"
+        ) from None
     return {str(key): value for key, value in plain.items()}
 
 

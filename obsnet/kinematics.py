@@ -57,7 +57,9 @@ def fit_straight_course(time: np.ndarray, east: np.ndarray, north: np.ndarray) -
     time = np.asarray(time, float)
     origin = time.mean()
     design = np.stack([np.ones_like(time), time - origin], axis=1)
-    (x0, vx), (y0, vy) = (np.linalg.lstsq(design, np.asarray(values, float), rcond=None)[0] for values in (east, north))
+    (x0, vx), (y0, vy) = (
+        np.linalg.lstsq(design, np.asarray(values, float), rcond=None)[0] for values in (east, north)
+    )
     speed = float(np.hypot(vx, vy))
     cpa_time = float(origin - (x0 * vx + y0 * vy) / max(speed**2, 1e-12))
     signed = float((x0 * vy - y0 * vx) / max(speed, 1e-12))

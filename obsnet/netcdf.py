@@ -59,7 +59,9 @@ class TimeWriter:
     def __enter__(self) -> TimeWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if kind is None:
             self.close()
             return
@@ -75,7 +77,9 @@ class TimeWriter:
             file.attrs[key] = value
         file.dimensions["time"] = None
         time = file.create_variable("time", ("time",), "f8", chunks=(4096,))
-        time.attrs.update({"units": "seconds since 1970-01-01T00:00:00Z", "standard_name": "time", "calendar": "standard"})
+        time.attrs.update(
+            {"units": "seconds since 1970-01-01T00:00:00Z", "standard_name": "time", "calendar": "standard"}
+        )
         for name, coordinate in block.coords.items():
             if name == "time" or coordinate.dims != (name,):
                 continue

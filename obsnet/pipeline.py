@@ -20,7 +20,7 @@ from obsnet.detectors.analytic import (
     RangeDetectorConfig,
 )
 from obsnet.detectors.background import BackgroundDirection
-from obsnet.detectors.maps import LikelihoodMaps, detections, log_mean_exp, range_presence
+from obsnet.detectors.maps import LikelihoodMaps, detections, presence
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -30,7 +30,6 @@ from obsnet.signals.azigram import AzigramConfig, azigram
 from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstrogram
 from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
-from obsnet.signals.waveforms import WaveformConfig
 from obsnet.trackers.grid_search import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
 
@@ -41,7 +40,6 @@ class RunConfig:
 
     detector: Literal["learned", "analytic"] = "analytic"
     tracker: Literal["grid", "bernoulli", "focalization"] = "grid"
-    waveforms: WaveformConfig = field(default_factory=WaveformConfig)
     spectra: SpectraConfig = field(default_factory=SpectraConfig)
     azigram: AzigramConfig = field(default_factory=AzigramConfig)
     cepstrogram: CepstrogramConfig = field(default_factory=CepstrogramConfig)
@@ -87,12 +85,18 @@ class Pipeline:
     ) -> None:
         self.station, self.config = station, config
         ocean = config.ocean
-        self.table = table if table is not None else propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
+        self.table = (
+            table
+            if table is not None
+            else propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
+        )
         amplitudes = amplitudes or Amplitudes.table_ii().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
         self._range = AnalyticRangeDetector(self.table, amplitudes, config.range, threads)
         self._clutter = ClutterFilter(config.cepstrogram)
-        self._background = BackgroundDirection(config.azimuth.background_window_s, config.azimuth.background_step_s)
+        self._background = BackgroundDirection(
+            config.azimuth.background_window_s, config.azimuth.background_step_s
+        )
         self._azigram: xr.DataArray | None = None
         self._null: np.ndarray | None = None
         self._cepstrogram: xr.DataArray | None = None
@@ -139,10 +143,13 @@ class Pipeline:
         if self._cepstrogram is not None:
             parts.append(self._range.maps(self._cepstrogram, minutes))
         if not parts:
-            raise ConfigError(f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with")
+            raise ConfigError(
+                f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with"
+            )
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
-        result = Minutes(maps, detections(maps), presence(maps), self._features(minutes))
+        ratios = presence(maps)
+        result = Minutes(maps, detections(maps, ratios), ratios, self._features(minutes))
         self._next = float(minutes[-1] + step)
         self._forget(self._next - self.config.azimuth.window_s / 2)
         return result
@@ -151,7 +158,11 @@ class Pipeline:
         """Spectrogram, azigram and cepstrogram thinned to one column a minute, for the eye."""
         features = {}
         step = self.config.azimuth.step_s
-        for name, held in (("power", self._spectrogram), ("azigram", self._azigram), ("cepstrogram", self._cepstrogram)):
+        for name, held in (
+            ("power", self._spectrogram),
+            ("azigram", self._azigram),
+            ("cepstrogram", self._cepstrogram),
+        ):
             if held is not None:
                 features[name] = _per_minute(held, minutes, step)
         return xr.Dataset(features).assign_coords(time=from_posix(minutes))
@@ -166,22 +177,13 @@ class Pipeline:
         self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
 
 
-def presence(maps: LikelihoodMaps) -> pd.DataFrame:
-    """Log presence ratios of the maps, as the segmentation takes them: indexed by s since 1970."""
-    columns = {}
-    if "azimuth_llr" in maps:
-        columns["azimuth"] = log_mean_exp(maps["azimuth_llr"].values, axis=-1)
-    if "range_llr" in maps:
-        llr, range_m, rate = maps["range_llr"].values, maps["range"].values, maps["range_rate"].values
-        columns["range"] = range_presence(llr, range_m)
-        columns["approaching"] = range_presence(llr[:, :, rate <= 0], range_m)
-        columns["leaving"] = range_presence(llr[:, :, rate >= 0], range_m)
-    return pd.DataFrame(columns, index=to_posix(maps["time"].values))
-
-
 def _power(spectra: xr.Dataset) -> xr.DataArray:
     """Power of the pressure (or of the ground motion without one) in bins of eight, so that a minute is small."""
-    values = spectra["p"] if "p" in spectra else spectra[next(name for name in ("down", "north", "east") if name in spectra)]
+    values = (
+        spectra["p"]
+        if "p" in spectra
+        else spectra[next(name for name in ("down", "north", "east") if name in spectra)]
+    )
     power = values.values.real**2 + values.values.imag**2
     bins = power.shape[0] // 8
     thinned = power[: bins * 8].reshape(bins, 8, -1).mean(axis=1)
@@ -196,14 +198,21 @@ def _per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.Da
     edges = np.searchsorted(times, np.append(minutes - step / 2, minutes[-1] + step / 2))
     values = frames.values
     valid = ~np.isnan(values[0])
-    total = np.concatenate([np.zeros((len(values), 1), values.dtype), np.cumsum(np.where(valid, values, 0), axis=1)], axis=1)
+    total = np.concatenate(
+        [np.zeros((len(values), 1), values.dtype), np.cumsum(np.where(valid, values, 0), axis=1)], axis=1
+    )
     count = np.concatenate([[0], np.cumsum(valid)])
     number = count[edges[1:]] - count[edges[:-1]]
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = (total[:, edges[1:]] - total[:, edges[:-1]]) / number
     mean[:, number == 0] = np.nan
     dim = frames.dims[0]
-    return xr.DataArray(mean, dims=(dim, "time"), coords={dim: frames[dim].values, "time": from_posix(minutes)}, attrs=frames.attrs)
+    return xr.DataArray(
+        mean,
+        dims=(dim, "time"),
+        coords={dim: frames[dim].values, "time": from_posix(minutes)},
+        attrs=frames.attrs,
+    )
 
 
 def _concat(held: xr.DataArray | None, new: xr.DataArray) -> xr.DataArray:

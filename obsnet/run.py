@@ -39,9 +39,6 @@ from obsnet.trackers.track import Segment, Track
 if TYPE_CHECKING:
     import obspy
 
-BLOCK_S = 10800.0
-"""Length of the blocks in which a record streams through."""
-
 Progress = Callable[[float, float], None]
 """Called with seconds of record done and in all."""
 
@@ -158,7 +155,9 @@ def _run(
 ) -> Run:
     clock = _Clock()
     threads = threads or os.cpu_count() or 1
-    source = open_waveforms(waveforms, station, config.waveforms, starttime, endtime)
+    source = open_waveforms(
+        waveforms, station, starttime=starttime, endtime=endtime, min_rate_hz=config.spectra.analysis_rate_hz
+    )
     clock.lap("open")
     pipeline = Pipeline(station, config, amplitudes, table, threads)
     clock.lap("model")
@@ -177,13 +176,13 @@ def _run(
 
 
 def _stream(source, station, config, pipeline, progress, clock) -> Iterator[Minutes]:
-    for spectra in iter_spectra(source, station, config.spectra, BLOCK_S):
+    for spectra in iter_spectra(source, config.spectra):
         clock.lap("spectra")
         minutes = pipeline.push(spectra)
         clock.lap("detect")
         if progress is not None and spectra.sizes["time"]:
-            done = float(to_posix(spectra["time"].values[-1])) - source.start
-            progress(done, source.end - source.start)
+            done = float(to_posix(spectra["time"].values[-1])) - source.begin_ns / 1e9
+            progress(done, (source.end_ns - source.begin_ns) / 1e9)
         if minutes is not None:
             yield minutes
     minutes = pipeline.flush()
@@ -231,7 +230,9 @@ class _MemorySink:
         def joined(datasets: list[xr.Dataset]) -> xr.Dataset:
             if not datasets:
                 return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
-            return xr.concat(datasets, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
+            return xr.concat(
+                datasets, "time", data_vars="minimal", coords="minimal", compat="override", join="override"
+            )
 
         return joined([m.maps for m in self._minutes]), joined([m.features for m in self._minutes])
 
@@ -256,7 +257,9 @@ class _FolderSink(_MemorySink):
         super().__init__()
         self._folder = prepare_folder(folder)
         attrs = {"station": station.code, "source": f"obsnet {obsnet.__version__}"}
-        self._writers = [netcdf.TimeWriter(self._folder / f"{name}.nc", attrs) for name in ("maps", "features")]
+        self._writers = [
+            netcdf.TimeWriter(self._folder / f"{name}.nc", attrs) for name in ("maps", "features")
+        ]
 
     def append(self, minutes: Minutes) -> None:
         self._writers[0].append(minutes.maps)
@@ -277,7 +280,15 @@ class _FolderSink(_MemorySink):
             writer.__exit__(*error)
 
 
-DETECTION_COLUMNS = ["time", "coverage", "azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr"]
+DETECTION_COLUMNS = [
+    "time",
+    "coverage",
+    "azimuth_deg",
+    "azimuth_llr",
+    "range_m",
+    "range_rate_mps",
+    "range_llr",
+]
 TRACK_COLUMNS = [
     "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
     "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
@@ -324,7 +335,14 @@ def detections_csv(detections: pd.DataFrame) -> str:
     table = detections.reindex(columns=DETECTION_COLUMNS).copy()
     stamps = table["time"].to_numpy("datetime64[s]")
     table["time"] = np.char.add(np.datetime_as_string(stamps), "Z") if len(stamps) else table["time"]
-    digits = {"coverage": 3, "azimuth_deg": 2, "azimuth_llr": 3, "range_m": 1, "range_rate_mps": 2, "range_llr": 3}
+    digits = {
+        "coverage": 3,
+        "azimuth_deg": 2,
+        "azimuth_llr": 3,
+        "range_m": 1,
+        "range_rate_mps": 2,
+        "range_llr": 3,
+    }
     return table.round(digits).to_csv(index=False)
 
 
@@ -342,7 +360,9 @@ def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
         properties = {key: None if value != value else value for key, value in found.row(number).items()}
         properties["times"] = [iso(t) for t in times]
         properties["method"] = found.method
-        coordinates = [[round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)]
+        coordinates = [
+            [round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)
+        ]
         line = {"type": "LineString", "coordinates": coordinates}
         features.append({"type": "Feature", "geometry": line, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
@@ -374,12 +394,13 @@ def _describe(run: Run, source: Any, clock: _Clock) -> dict[str, Any]:
             "depth_m": run.station.depth_m,
         },
         "waveforms": source.report.to_dict(),
-        "start": iso(source.start),
-        "end": iso(source.end),
+        "start": iso(source.begin_ns / 1e9),
+        "end": iso(source.end_ns / 1e9),
         "config": to_dict(run.config),
         "models": {},
         "segments": [
-            {"start": iso(s.start), "end": iso(s.end), "cpa": None if s.cpa is None else iso(s.cpa)} for s in run.segments
+            {"start": iso(s.start), "end": iso(s.end), "cpa": None if s.cpa is None else iso(s.cpa)}
+            for s in run.segments
         ],
         "tracks": len(run.tracks),
         "notes": _notes(run),

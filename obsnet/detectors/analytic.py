@@ -27,8 +27,8 @@ from obsnet.signals.cepstrogram import noise_std
 EXPONENT_LIMIT = 690.0
 """Largest log that a float64 product can hold."""
 
-UNHEARD = 1e-4
-"""Cepstral amplitude, a hundredth of the noise of a 1024-sample frame, below which a pair counts as silent."""
+UNHEARD = 1e-3
+"""Cepstral amplitude, a tenth of the noise of a 1024-sample frame, below which a pair counts as silent."""
 
 
 def _check_windows(window_s: float, step_s: float) -> None:
@@ -93,7 +93,13 @@ class RangeDetectorConfig:
 
     def __post_init__(self) -> None:
         _check_windows(self.window_s, self.step_s)
-        for name in ("range_step_m", "max_range_m", "range_rate_step_mps", "max_range_rate_mps", "pulse_width_s"):
+        for name in (
+            "range_step_m",
+            "max_range_m",
+            "range_rate_step_mps",
+            "max_range_rate_mps",
+            "pulse_width_s",
+        ):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
         if self.wander_bins < 0:
@@ -122,12 +128,16 @@ class AnalyticAzimuthDetector:
 
     name = "analytic"
 
-    def __init__(self, config: AzimuthDetectorConfig = AzimuthDetectorConfig(), threads: int | None = None) -> None:
+    def __init__(
+        self, config: AzimuthDetectorConfig = AzimuthDetectorConfig(), threads: int | None = None
+    ) -> None:
         self.config = config
         self.window_s = config.window_s
         self._threads = threads or os.cpu_count() or 1
 
-    def maps(self, azigram: xr.DataArray, minutes: np.ndarray, background: np.ndarray | None = None) -> xr.Dataset:
+    def maps(
+        self, azigram: xr.DataArray, minutes: np.ndarray, background: np.ndarray | None = None
+    ) -> xr.Dataset:
         """Log-likelihood ratio against azimuth and its coverage at `minutes`.
 
         Parameters
@@ -222,20 +232,43 @@ class AnalyticRangeDetector:
         valid = ~np.isnan(frames[:, 0])
         scores, active, pad = self._scores(cepstrogram, np.where(valid[:, None], frames, 0.0), valid)
         start, stop = window_bounds(times, minutes, config.window_s)
-        llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
-        kernel = _gaussian(config.wander_bins)
+        llr = np.zeros((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
 
         def one(lo: int, hi: int) -> None:
-            kernels.slant_stack(
-                scores, active, pad, start[lo:hi], stop[lo:hi], times, minutes[lo:hi], config.range_step_m,
-                config.range_rate, kernel, llr[lo:hi],
-            )  # fmt: skip
+            window = (start[lo:hi], stop[lo:hi], times, minutes[lo:hi])
+            llr[lo:hi] = self._stack(scores, active, pad, *window).transpose(0, 2, 1)
 
-        bounds = np.linspace(0, len(minutes), self._threads + 1).astype(int)
+        bounds = np.unique(np.append(np.arange(0, len(minutes), 8), len(minutes)))
         _in_threads(one, list(zip(bounds[:-1], bounds[1:], strict=True)), self._threads)
         covered = coverage(valid, start, stop, minutes, config.window_s, _hop(times))
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
+
+    def _stack(self, scores, active, pad, start, stop, times, minutes) -> np.ndarray:
+        """Sum over the pairs of the log of the wandering mean of exp(slant stack); (window, range rate, range) float32."""
+        config = self.config
+        n_range = len(config.range_m)
+        kernel = _gaussian(config.wander_bins)
+        radius = len(kernel) // 2
+        total = np.zeros((len(minutes), len(config.range_rate), n_range), np.float32)
+        for pair, (first, last) in zip(scores, active, strict=True):
+            lo, hi = max(first - radius - pad, 0), min(last + radius + pad, n_range)
+            if hi <= lo:
+                continue
+            raised = np.zeros((len(minutes), len(config.range_rate), hi - lo + 2 * radius))
+            inner = slice(max(radius - lo, 0), hi - lo + 2 * radius - max(hi + radius - n_range, 0))
+            begin = lo - radius + inner.start
+            beam = np.empty((*raised.shape[:2], inner.stop - inner.start))
+            kernels.slant_stack(
+                pair, pad, begin, start, stop, times, minutes, config.range_step_m, config.range_rate, beam
+            )
+            np.exp(beam, out=raised[:, :, inner])
+            on_grid = np.zeros(raised.shape[2])
+            on_grid[inner] = 1.0
+            smooth = np.empty((*raised.shape[:2], hi - lo))
+            kernels.wander(raised, kernel, np.convolve(on_grid, kernel, "valid"), smooth)
+            total[:, :, lo:hi] += np.log(smooth, out=smooth)
+        return total
 
     def _scores(self, cepstrogram: xr.DataArray, frames: np.ndarray, valid: np.ndarray):
         """Per-frame log-likelihood ratio of every pair and range: a matrix product with the matched pulses."""
@@ -247,7 +280,9 @@ class AnalyticRangeDetector:
             weight = pulses / noise_std(quefrency, nfft) ** 2
             energy = 0.5 * np.einsum("prq,prq->pr", weight, pulses)
             heard = np.abs(pulses).max(axis=2) > 0
-            active = np.array([[row.argmax(), len(row) - row[::-1].argmax()] if row.any() else [0, 0] for row in heard])
+            active = np.array(
+                [[row.argmax(), len(row) - row[::-1].argmax()] if row.any() else [0, 0] for row in heard]
+            )
             self._model = (weight.astype(np.float32), energy.astype(np.float32), active.astype(np.int64))
             self._quefrency = quefrency
         weight, energy, active = self._model
@@ -316,7 +351,9 @@ def null_density(phasor: np.ndarray, background: np.ndarray | None, cap: float =
     return (1.0 - modulus**2) / (1.0 - 2.0 * modulus * aligned + modulus**2)
 
 
-def azimuth_maps(llr: np.ndarray, covered: np.ndarray, minutes: np.ndarray, azimuth: np.ndarray) -> xr.Dataset:
+def azimuth_maps(
+    llr: np.ndarray, covered: np.ndarray, minutes: np.ndarray, azimuth: np.ndarray
+) -> xr.Dataset:
     """Label an azimuth log-likelihood ratio (time, azimuth) as likelihood maps."""
     return xr.Dataset(
         {
@@ -349,7 +386,7 @@ _LLR = {"long_name": "natural log of the likelihood ratio, a ship here against n
 
 def _interp_phase(phase_deg: xr.DataArray, range_m: np.ndarray) -> np.ndarray:
     """Phase [rad] at `range_m`, interpolated on the circle."""
-    phasor = np.exp(1j * phase_deg)
+    phasor = np.exp(1j * np.deg2rad(phase_deg))
     return np.angle(phasor.interp(range=range_m).values)
 
 

@@ -102,61 +102,52 @@ def impulsive(real, imag, null, start, stop, cosine, sine, concentration, expone
 
 
 @njit(cache=True, nogil=True)
-def slant_stack(scores, active, pad, start, stop, frame_time, minutes, range_step, range_rate, kernel, out):
-    """Stack cepstral scores along r + v·δt, let the range wander a little, sum the path pairs (eq. 19).
+def slant_stack(scores, pad, first, start, stop, frame_time, minutes, range_step, range_rate, beam):
+    """Stack one pair's cepstral scores along r + v·δt (the sum over time of eq. 19).
 
     Parameters
     ----------
-    scores : (n_pairs, n_frames, n_range + 2·pad) float32 log-likelihood ratio of each frame, zero in the pads.
-    active : (n_pairs, 2) first and one-past-last range bin where the pair can be heard.
+    scores : (n_frames, n_range + 2·pad) float32 log-likelihood ratio of each frame, zero in the pads.
+    first : range bin of the beam's first sample.
     start, stop : (n_windows) frames of each window. frame_time, minutes : s. range_step : m. range_rate : (n_rates) m/s.
-    kernel : (2·radius + 1) weights of the wandering in range, odd length, sum 1.
-    out : (n_windows, n_range, n_rates) float32, overwritten.
+    beam : (n_windows, n_rates, n) float64, overwritten; bounded to what exp can hold.
     """
-    n_pairs = scores.shape[0]
-    n_range = scores.shape[2] - 2 * pad
-    radius = kernel.shape[0] // 2
-    beam = np.empty(n_range + 2 * radius, np.float32)
-    raised = np.empty(n_range + 2 * radius)
-    smooth = np.empty(n_range)
-    for w in range(out.shape[0]):
-        out[w] = 0.0
+    count = beam.shape[2]
+    total = np.empty(count, np.float32)
+    for w in range(beam.shape[0]):
         for k in range(range_rate.shape[0]):
-            for p in range(n_pairs):
-                lo = max(active[p, 0] - radius - pad, 0)
-                hi = min(active[p, 1] + radius + pad, n_range)
-                if hi <= lo:
-                    continue
-                first = max(lo - radius, 0)
-                last = min(hi + radius, n_range)
-                for i in range(first, last):
-                    beam[i] = 0.0
-                for t in range(start[w], stop[w]):
-                    shift = range_rate[k] * (frame_time[t] - minutes[w]) / range_step
-                    whole = np.int64(np.floor(shift))
-                    right = np.float32(shift - whole)
-                    left = np.float32(1.0) - right
-                    row = scores[p, t]
-                    offset = pad + whole
-                    for i in range(first, last):
-                        beam[i] += left * row[i + offset] + right * row[i + offset + 1]
-                _wander(beam, raised, smooth, kernel, lo, hi, first, last)
-                for i in range(lo, hi):
-                    out[w, i, k] += np.float32(smooth[i])
+            total[:] = np.float32(0.0)
+            for t in range(start[w], stop[w]):
+                shift = range_rate[k] * (frame_time[t] - minutes[w]) / range_step
+                whole = int(np.floor(shift))
+                right = np.float32(shift - whole)
+                left = np.float32(1.0) - right
+                row = scores[t, pad + first + whole : pad + first + whole + count + 1]
+                for i in range(count):
+                    total[i] += left * row[i] + right * row[i + 1]
+            for i in range(count):
+                value = total[i]
+                value = value if value < 600.0 else np.float32(600.0)
+                beam[w, k, i] = value if value > -600.0 else np.float32(-600.0)
 
 
 @njit(cache=True, nogil=True)
-def _wander(beam, raised, smooth, kernel, lo, hi, first, last):
-    """smooth = log of the kernel-weighted mean of exp(beam), the kernel renormalised at the grid's ends."""
-    radius = kernel.shape[0] // 2
-    for i in range(first, last):
-        raised[i] = np.exp(min(max(np.float64(beam[i]), -600.0), 600.0))
-    for i in range(lo, hi):
-        a = max(i - radius, first)
-        b = min(i + radius + 1, last)
-        total = 0.0
-        weight = 0.0
-        for j in range(a, b):
-            total += kernel[j - i + radius] * raised[j]
-            weight += kernel[j - i + radius]
-        smooth[i] = np.log(total / weight)
+def wander(raised, kernel, ends, smooth):
+    """Mean of exp(score) over a little wandering in range, the kernel renormalised at the ends of the range grid.
+
+    Parameters
+    ----------
+    raised : (n_windows, n_rates, n + 2·radius) float64. kernel : (2·radius + 1). ends : (n) sum of the kernel on the grid.
+    smooth : (n_windows, n_rates, n) float64, overwritten.
+    """
+    taps = kernel.shape[0]
+    for w in range(raised.shape[0]):
+        for k in range(raised.shape[1]):
+            row, target = raised[w, k], smooth[w, k]
+            target[:] = 0.0
+            for j in range(taps):
+                weight = kernel[j]
+                for i in range(target.shape[0]):
+                    target[i] += weight * row[i + j]
+            for i in range(target.shape[0]):
+                target[i] /= ends[i]

@@ -17,6 +17,7 @@ import pandas as pd
 import xarray as xr
 
 from obsnet.errors import LayoutError
+from obsnet.layout import to_posix
 
 LikelihoodMaps: TypeAlias = xr.Dataset
 
@@ -32,7 +33,9 @@ class Detector(Protocol):
         ...
 
 
-def window_bounds(frame_time: np.ndarray, minutes: np.ndarray, window_s: float) -> tuple[np.ndarray, np.ndarray]:
+def window_bounds(
+    frame_time: np.ndarray, minutes: np.ndarray, window_s: float
+) -> tuple[np.ndarray, np.ndarray]:
     """First and one-past-last frame whose centre lies in [minute − window/2, minute + window/2)."""
     start = np.searchsorted(frame_time, minutes - window_s / 2 - 1e-6)
     stop = np.searchsorted(frame_time, minutes + window_s / 2 - 1e-6)
@@ -56,15 +59,13 @@ def coverage(
     return np.minimum(found / expected, 1.0).astype(np.float32)
 
 
-def log_mean_exp(values: np.ndarray, axis: int | tuple[int, ...], weights: np.ndarray | None = None) -> np.ndarray:
+def log_mean_exp(
+    values: np.ndarray, axis: int | tuple[int, ...], weights: np.ndarray | None = None
+) -> np.ndarray:
     """Logarithm of the (weighted) mean of exp(values); NaN only where all of a slice is NaN."""
     top = np.max(values, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
-    raised = np.exp(values - top)
-    if weights is None:
-        mean = raised.mean(axis=axis)
-    else:
-        mean = (raised * weights).sum(axis=axis) / weights.sum()
+    mean = np.exp(values - top).mean(axis=axis)
     with np.errstate(divide="ignore"):
         return np.log(mean) + np.squeeze(top, axis=axis)
 
@@ -79,50 +80,83 @@ def range_rate_marginal(range_llr: np.ndarray) -> np.ndarray:
     return log_mean_exp(range_llr, axis=-1)
 
 
-def range_presence(range_llr: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """Log marginal posterior ratio of presence, prior proportional to range, uniform in range rate (eqs 20, 22)."""
-    return log_mean_exp(range_rate_marginal(range_llr), axis=-1, weights=np.maximum(range_m, 0.0))
+def range_presence(range_llr: np.ndarray, range_m: np.ndarray, range_rate: np.ndarray) -> dict[str, np.ndarray]:
+    """Log marginal posterior ratios of presence: of any ship, of an `approaching` and of a `leaving` one.
+
+    The prior is proportional to range and uniform in range rate (paper's eqs 20, 22); for a closing or an opening ship it is
+    the same over half of the range rates (eq. 25).
+    """
+    top = np.max(range_llr, axis=(1, 2), keepdims=True)
+    top = np.where(np.isfinite(top), top, np.float32(0.0))
+    raised = np.exp(range_llr - top)
+    prior = (np.maximum(range_m, 0.0) / np.maximum(range_m, 0.0).sum()).astype(np.float32)
+    per_rate = np.einsum("trv,r->tv", raised, prior)
+    with np.errstate(divide="ignore"):
+        return {
+            name: np.log(per_rate[:, chosen].mean(axis=1)) + top[:, 0, 0]
+            for name, chosen in (
+                ("range", slice(None)),
+                ("approaching", range_rate <= 0),
+                ("leaving", range_rate >= 0),
+            )
+        }
 
 
-def detections(maps: LikelihoodMaps) -> pd.DataFrame:
+def presence(maps: LikelihoodMaps) -> pd.DataFrame:
+    """Log presence ratios of the maps, as the segmentation takes them: indexed by s since 1970, NaN without coverage.
+
+    Raises
+    ------
+    LayoutError : the maps hold neither azimuth_llr nor range_llr.
+    """
+    if "azimuth_llr" not in maps and "range_llr" not in maps:
+        raise LayoutError(f"likelihood maps hold azimuth_llr or range_llr, found {', '.join(map(str, maps)) or 'nothing'}")
+    columns: dict[str, np.ndarray] = {}
+    if "azimuth_llr" in maps:
+        columns["azimuth"] = azimuth_presence(maps["azimuth_llr"].values)
+    if "range_llr" in maps:
+        columns |= range_presence(maps["range_llr"].values, maps["range"].values, maps["range_rate"].values)
+    table = pd.DataFrame(columns, index=to_posix(maps["time"].values))
+    for name in ("azimuth", "range"):
+        if f"{name}_llr" in maps:
+            silent = maps[f"{name}_coverage"].values == 0
+            table.loc[silent, [c for c in columns if (c == "azimuth") == (name == "azimuth")]] = np.nan
+    return table
+
+
+def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.DataFrame:
     """One row a minute: what the maps say, read off at their posterior's maximum (paper's eqs 13 and 23).
 
     Parameters
     ----------
     maps : LikelihoodMaps with dims time and azimuth and/or range and range_rate.
+    ratios : DataFrame of `presence`, if it is there already.
 
     Returns
     -------
     DataFrame with columns time, coverage, azimuth_deg, azimuth_llr, range_m, range_rate_mps, range_llr. The `_llr` columns
     are log marginal posterior ratios of presence, filled where there is coverage; estimates are NaN where they are ≤ 0.
     """
-    if "azimuth_llr" not in maps and "range_llr" not in maps:
-        raise LayoutError(f"likelihood maps hold azimuth_llr or range_llr, found {', '.join(map(str, maps)) or 'nothing'}")
-    count = maps.sizes["time"]
-    table = {
-        name: np.full(count, np.nan)
-        for name in ("azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr")
-    }
-    covered = np.zeros(count)
+    ratios = presence(maps) if ratios is None else ratios
+    empty = np.full(maps.sizes["time"], np.nan)
+    table = {name: empty.copy() for name in ("azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr")}
+    covered = np.zeros(maps.sizes["time"])
     if "azimuth_llr" in maps:
-        there = maps["azimuth_coverage"].values > 0
         covered = np.maximum(covered, maps["azimuth_coverage"].values)
-        llr = maps["azimuth_llr"].values
-        table["azimuth_llr"][there] = azimuth_presence(llr[there])
+        table["azimuth_llr"] = ratios["azimuth"].to_numpy()
         found = table["azimuth_llr"] > 0
-        table["azimuth_deg"][found] = _peak_azimuth(llr[found], maps["azimuth"].values)
+        table["azimuth_deg"][found] = _peak_azimuth(maps["azimuth_llr"].values[found], maps["azimuth"].values)
     if "range_llr" in maps:
-        there = maps["range_coverage"].values > 0
         covered = np.maximum(covered, maps["range_coverage"].values)
         range_m, rate = maps["range"].values, maps["range_rate"].values
-        llr = maps["range_llr"].values
-        table["range_llr"][there] = range_presence(llr[there], range_m)
-        found = table["range_llr"] > 0
+        table["range_llr"] = ratios["range"].to_numpy()
+        found = np.flatnonzero(table["range_llr"] > 0)
         with np.errstate(divide="ignore"):
-            posterior = llr[found] + np.log(np.maximum(range_m, 0.0))[None, :, None].astype(np.float32)
-        best = posterior.reshape(len(posterior), -1).argmax(axis=1) if found.any() else np.empty(0, int)
-        i, j = np.unravel_index(best, llr.shape[1:])
-        table["range_m"][found], table["range_rate_mps"][found] = range_m[i], rate[j]
+            log_prior = np.log(np.maximum(range_m, 0.0)).astype(np.float32)[:, None]
+        for minute in found:
+            best = int((maps["range_llr"].values[minute] + log_prior).argmax())
+            table["range_m"][minute] = range_m[best // len(rate)]
+            table["range_rate_mps"][minute] = rate[best % len(rate)]
     return pd.DataFrame({"time": maps["time"].values, "coverage": covered, **table})
 
 

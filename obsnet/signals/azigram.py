@@ -56,12 +56,16 @@ def azigram(spectra: xr.Dataset, config: AzigramConfig = AzigramConfig()) -> xr.
     require(spectra, SPECTRA)
     missing = [name for name in ("east", "north") if name not in spectra]
     if missing:
-        raise LayoutError(f"an azigram needs both horizontals; {' and '.join(missing)} missing from the spectra")
+        raise LayoutError(
+            f"an azigram needs both horizontals; {' and '.join(missing)} missing from the spectra"
+        )
     method = config.method
     if method == "auto":
         method = "intensity" if "p" in spectra else "polarisation"
     if method == "intensity" and "p" not in spectra:
-        raise LayoutError("the active intensity needs the hydrophone (p); use method 'polarisation' without one")
+        raise LayoutError(
+            "the active intensity needs the hydrophone (p); use method 'polarisation' without one"
+        )
     band = _band(spectra["frequency"].values, config)
     east, north = spectra["east"].values[band], spectra["north"].values[band]
     if method == "intensity":

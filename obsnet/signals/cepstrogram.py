@@ -99,90 +99,120 @@ class ClutterFilter:
 
     def __init__(self, config: CepstrogramConfig = CepstrogramConfig()) -> None:
         self.config = config
-        self._time = np.empty(0)
-        self._frames = np.empty((0, 0), np.float32)
+        self._steps: dict[int, _Step] = {}
         self._learned: np.ndarray | None = None
+        self._learned_step: int | None = None
 
     def __call__(self, cepstra: xr.DataArray) -> xr.DataArray:
         """Filter the next block of frames, dims (quefrency, time); blocks must come in time order."""
         if self.config.clutter == "none":
             return cepstra
-        time = to_posix(cepstra["time"].values)
         values = np.ascontiguousarray(cepstra.values.T)
-        if self._frames.shape[1] != values.shape[1]:
-            self._frames = np.empty((0, values.shape[1]), np.float32)
+        steps = np.floor(to_posix(cepstra["time"].values) / self.config.clutter_step_s).astype(np.int64)
         filtered = np.full_like(values, np.nan)
         done = 0
-        while done < len(time):
-            if self._is_due(time[done]):
-                self._learn(time[done])
-            end = self._next_instant(time, values, done)
+        while done < len(steps):
+            step = int(steps[done])
+            if self._is_due(step):
+                self._learn(step)
+            end = self._next_instant(steps, values, done)
             if self._learned is not None:
                 filtered[done:end] = self._project(values[done:end])
-            self._remember(time[done:end], values[done:end])
+            self._remember(step, values[done:end])
             done = end
         return cepstra.copy(data=np.ascontiguousarray(filtered.T))
 
-    def _is_due(self, time: float) -> bool:
+    def _is_due(self, step: int) -> bool:
         if self._learned is None:
-            return len(self._frames) >= self.WARM_UP_FRAMES
-        step = self.config.clutter_step_s
-        return np.floor(time / step) > np.floor(self._time[-1] / step)
+            return sum(held.count for held in self._steps.values()) >= self.WARM_UP_FRAMES
+        return step != self._learned_step
 
-    def _next_instant(self, time: np.ndarray, values: np.ndarray, done: int) -> int:
-        """First frame from `done` + 1 on before which the filter must look whether to learn anew."""
-        step = self.config.clutter_step_s
-        end = int(np.searchsorted(time, (np.floor(time[done] / step) + 1.0) * step))
+    def _next_instant(self, steps: np.ndarray, values: np.ndarray, done: int) -> int:
+        """First frame after `done` before which the filter must look whether to learn anew."""
+        end = int(np.searchsorted(steps, steps[done], side="right"))
         if self._learned is None:
-            valid = np.cumsum(~np.isnan(values[done:end, 0])) + len(self._frames)
+            held = sum(held.count for held in self._steps.values())
+            valid = np.cumsum(~np.isnan(values[done:end, 0])) + held
             end = min(end, done + 1 + int(np.searchsorted(valid, self.WARM_UP_FRAMES)))
         return max(end, done + 1)
 
-    def _learn(self, instant: float) -> None:
-        recent = self._time >= instant - self.config.clutter_window_s
-        self._time, self._frames = self._time[recent], self._frames[recent]
-        if len(self._frames) < self.WARM_UP_FRAMES:
+    def _learn(self, step: int) -> None:
+        oldest = step - round(self.config.clutter_window_s / self.config.clutter_step_s)
+        self._steps = {key: held for key, held in self._steps.items() if key >= oldest}
+        count = sum(held.count for held in self._steps.values())
+        self._learned_step = step
+        if count < self.WARM_UP_FRAMES:
             self._learned = None
         elif self.config.clutter == "svd":
-            self._learned = leading_basis(self._frames)
+            self._learned = leading_basis(sum(held.moment for held in self._steps.values()), count)
         else:
-            self._learned = self._frames.mean(axis=0)
+            self._learned = sum(held.moment for held in self._steps.values()) / count
 
     def _project(self, frames: np.ndarray) -> np.ndarray:
         if self.config.clutter == "svd":
             return frames - (frames @ self._learned) @ self._learned.T
-        return frames - self._learned
+        return frames - self._learned.astype(frames.dtype)
 
-    def _remember(self, time: np.ndarray, frames: np.ndarray) -> None:
-        valid = ~np.isnan(frames[:, 0])
-        self._time = np.concatenate([self._time, time[valid]])
-        self._frames = np.concatenate([self._frames, frames[valid]])
+    def _remember(self, step: int, frames: np.ndarray) -> None:
+        valid = frames[~np.isnan(frames[:, 0])].astype(float)
+        moment = valid.T @ valid if self.config.clutter == "svd" else valid.sum(axis=0)
+        held = self._steps.get(step)
+        self._steps[step] = _Step(len(valid), moment) if held is None else held + _Step(len(valid), moment)
 
 
-def leading_basis(frames: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True)
+class _Step:
+    """What the filter keeps of one step: how many frames, and their Gram matrix over quefrency (or their sum)."""
+
+    count: int
+    moment: np.ndarray
+
+    def __add__(self, other: _Step) -> _Step:
+        return _Step(self.count + other.count, self.moment + other.moment)
+
+
+def leading_basis(gram: np.ndarray, count: int, guess: int = 32) -> np.ndarray:
     """Orthonormal vectors over quefrency before the knee of the singular values.
 
     Parameters
     ----------
-    frames : array (n_frames, n_quefrency), without gaps.
+    gram : array (n_quefrency, n_quefrency), Gram matrix of `count` frames.
+    guess : how many singular values to look for the knee among at first; doubled until the knee lies inside.
 
     Returns
     -------
     array float32 (n_quefrency, n_kept): the singular vectors whose singular values come before the knee.
     """
-    gram = frames.T @ frames
-    values, vectors = scipy.linalg.eigh(gram, check_finite=False)
-    singular = np.sqrt(np.maximum(values[::-1], 0.0))[: min(frames.shape)]
-    keep = knee(singular)
-    return np.ascontiguousarray(vectors[:, ::-1][:, :keep], dtype=np.float32)
+    total = min(len(gram), count)
+    while True:
+        size = min(guess, total)
+        values, vectors = _leading_eigenpairs(gram, size)
+        keep = knee(np.sqrt(np.maximum(values, 0.0)), total)
+        if keep < size // 2 or size == total:
+            return np.ascontiguousarray(vectors[:, :keep], dtype=np.float32)
+        guess *= 2
 
 
-def knee(decreasing: np.ndarray) -> int:
+def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Largest eigenvalues, decreasing, and their vectors, by subspace iteration from a fixed start."""
+    if 2 * size >= len(matrix):
+        values, vectors = scipy.linalg.eigh(matrix, check_finite=False)
+        return values[::-1][:size], vectors[:, ::-1][:, :size]
+    basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8))
+    for _ in range(12):
+        basis, _ = np.linalg.qr(matrix @ basis)
+    values, turn = scipy.linalg.eigh(basis.T @ matrix @ basis, check_finite=False)
+    return values[::-1][:size], (basis @ turn)[:, ::-1][:, :size]
+
+
+def knee(decreasing: np.ndarray, total: int | None = None) -> int:
     """Index of the knee of a decreasing curve, normalised on both axes (kneedle, Satopaa et al. 2011).
+
+    `total` is the length of the whole curve where only its beginning is given.
 
     >>> knee(np.array([10.0, 1.0, 0.9, 0.8, 0.7, 0.6]))
     1
     """
     y = decreasing / decreasing[0] if decreasing[0] > 0 else decreasing
-    x = np.linspace(0.0, 1.0, len(decreasing))
+    x = np.arange(len(decreasing)) / max((total or len(decreasing)) - 1, 1)
     return int(np.argmax(1.0 - y - x))

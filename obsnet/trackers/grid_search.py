@@ -28,8 +28,7 @@ from obsnet.trackers.track import Segment, Track
 class GridSearchConfig:
     """Prior, likelihood and levels of the grid search.
 
-    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are scaled down, keeping their
-    shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach.
+    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach.
     """
 
     azimuth_detection_probability: float = 0.9
@@ -51,8 +50,18 @@ class GridSearchConfig:
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ConfigError(f"{name} must lie in (0, 1), found {getattr(self, name)}")
         if not 0.0 < self.min_speed_mps < self.max_speed_mps:
-            raise ConfigError(f"min_speed_mps must lie below max_speed_mps, found {self.min_speed_mps}, {self.max_speed_mps}")
-        for name in ("tile_s", "tile_bound", "exponent", "max_cpa_range_m", "candidates", "max_ships", "samples"):
+            raise ConfigError(
+                f"min_speed_mps must lie below max_speed_mps, found {self.min_speed_mps}, {self.max_speed_mps}"
+            )
+        for name in (
+            "tile_s",
+            "tile_bound",
+            "exponent",
+            "max_cpa_range_m",
+            "candidates",
+            "max_ships",
+            "samples",
+        ):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
 
@@ -77,6 +86,7 @@ class _Scores:
     geometry: np.ndarray
     azimuth_score: np.ndarray
     azimuth_step: float
+    jointly: bool
 
 
 def search(
@@ -107,8 +117,8 @@ def search(
     times, azimuth_llr, range_llr = tiles
     finder = _Finder(maps, times, segment, delay, config, threads)
     tracks: list[Track] = []
-    for _ in range(config.max_ships):
-        track = finder.find(azimuth_llr, range_llr)
+    for number in range(config.max_ships):
+        track = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
         if track is None or track.log_bayes_factor < config.min_log_bayes_factor:
             break
         tracks.append(track)
@@ -131,10 +141,15 @@ class _Finder:
         self.delay_step = 250.0
         self.delay = np.asarray(delay(np.arange(0.0, 150_001.0, self.delay_step)), float)
 
-    def find(self, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None) -> Track | None:
-        """The best track of the tiles, or none if no hypothesis scores above 0."""
-        coarse = self._scores(azimuth_llr, range_llr, pool=7, stds=(2.0, 10.0, 1.0))
-        fine = self._scores(azimuth_llr, range_llr, pool=1, stds=(3.0, 3.0, 0.7))
+    def find(
+        self, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None, jointly: bool = False
+    ) -> Track | None:
+        """The best track of the tiles, or none if no hypothesis scores above 0.
+
+        A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
+        """
+        coarse = self._scores(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
+        fine = self._scores(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
         best: tuple[float, np.ndarray] | None = None
         for start in self._coarse(coarse):
             value, point = self._level(start, MEDIUM, fine)
@@ -168,13 +183,17 @@ class _Finder:
                 break
             found.append(np.array([cpa_time[t], cpa_range[i], course[q], speed[j]]))
             courses = np.arange(q - 2, q + 3) % len(course)
-            around = np.ix_(_near(t, 3, len(cpa_time)), _near(i, 3, len(cpa_range)), _near(j, 2, len(speed)), courses)
+            around = np.ix_(
+                _near(t, 3, len(cpa_time)), _near(i, 3, len(cpa_range)), _near(j, 2, len(speed)), courses
+            )
             values[around] = -1.0
         return found
 
     def _level(self, centre: np.ndarray, level: _Level, scores: _Scores) -> tuple[float, np.ndarray]:
         """Best score and hypothesis of a grid around `centre`."""
-        axes = [c + np.arange(-h, h + s / 2, s) for c, h, s in zip(centre, level.half, level.step, strict=True)]
+        axes = [
+            c + np.arange(-h, h + s / 2, s) for c, h, s in zip(centre, level.half, level.step, strict=True)
+        ]
         cpa_time, cpa_range, course, speed = axes
         speed = speed[speed > 0.5]
         course = course if self.sees_course else centre[2:3]
@@ -187,19 +206,23 @@ class _Finder:
         offset, index = np.unique(np.round(self.tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
         index = index.reshape(len(cpa_time), len(self.tiles))
         shape = (len(cpa_range), len(speed), len(offset))
-        distance, rate, bearing = (np.empty(shape, np.float32) for _ in range(3))
+        across, along = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        row = np.empty(shape, np.int32)
         out = np.empty((len(cpa_time), len(cpa_range), len(speed), len(course)), np.float32)
         course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
         rows, step = _polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
+        phases, length = rows.shape[1:]
+        flat = rows.reshape(len(rows), -1)
 
-        def table(part: np.ndarray) -> None:
+        def table(part: slice) -> None:
             search_kernels.tabulate(
-                offset, cpa_range[part], speed, self.delay, self.delay_step, distance[part], rate[part], bearing[part]
-            )
+                offset, cpa_range[part], speed, self.delay, self.delay_step, scores.geometry, step, course[0], phases, length,
+                across[part], along[part], row[part],
+            )  # fmt: skip
 
-        def total(part: np.ndarray) -> None:
+        def total(part: slice) -> None:
             search_kernels.sum_scores(
-                index[part], distance, rate, bearing, scores.range_score, scores.geometry, rows, step, course[0], out[part]
+                index[part], across, along, row, scores.range_score, flat, scores.jointly, out[part]
             )
 
         self._share(table, len(cpa_range))
@@ -220,7 +243,7 @@ class _Finder:
         per_tile = np.zeros((len(self.tiles), len(points) if keep_tiles else 0))
         search_kernels.score_points(
             np.ascontiguousarray(points), self.tiles, self.delay, self.delay_step, scores.range_score, scores.geometry,
-            scores.azimuth_score, scores.azimuth_step, per_tile, out,
+            scores.azimuth_score, scores.azimuth_step, scores.jointly, per_tile, out,
         )  # fmt: skip
         return (out, per_tile) if keep_tiles else out
 
@@ -256,7 +279,9 @@ class _Finder:
         motion = StraightCourse(self.origin + mean[0], float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
         method = "grid search" if self.sees_course and self.sees_range else _blind(self.sees_course)
         start, end = self.origin + self.tiles[lo], self.origin + self.tiles[hi]
-        return Track(float(start), float(end), motion, cov, log_bayes_factor, method, {"score": float(score[0])})
+        return Track(
+            float(start), float(end), motion, cov, log_bayes_factor, method, {"score": float(score[0])}
+        )
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
@@ -268,7 +293,9 @@ class _Finder:
             & (points[:, 0] <= self.tiles[-1] + 1800.0)
         )
 
-    def _scores(self, azimuth_llr, range_llr, pool: int, stds: tuple[float, float, float]) -> _Scores:
+    def _scores(
+        self, azimuth_llr, range_llr, jointly: bool, pool: int, stds: tuple[float, float, float]
+    ) -> _Scores:
         """Score maps at one smoothing: range bins (of `pool` grid steps), azimuth [deg], range rate bins."""
         config = self.config
         n = len(self.tiles)
@@ -293,14 +320,18 @@ class _Finder:
             range_score = _mixed(ratio, top, config.range_detection_probability)
         first = float(self.range_m[0]) + (spacing - spacing / pool) / 2
         geometry = np.array([first, spacing, float(self.rate[0]), rate_step])
-        return _Scores(range_score, geometry, azimuth_score, step)
+        return _Scores(range_score, geometry, azimuth_score, step, jointly)
 
     def without(self, track: Track, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None):
         """The maps with what a track explains made silent, for the search of the next ship."""
         emitted = self.origin + self.tiles
         for _ in range(3):
             _, distance, _ = track.motion.observables(emitted)
-            emitted = self.origin + self.tiles - np.interp(distance, self.delay_step * np.arange(len(self.delay)), self.delay)
+            emitted = (
+                self.origin
+                + self.tiles
+                - np.interp(distance, self.delay_step * np.arange(len(self.delay)), self.delay)
+            )
         azimuth, distance, rate = track.motion.observables(emitted)
         if azimuth_llr is not None:
             near = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= 30.0
@@ -327,12 +358,10 @@ def _tiles(maps: xr.Dataset, segment: Segment, config: GridSearchConfig):
 
 
 def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """exp(llr − top) and top per tile, tiles that say more than `bound` scaled down; NaN tiles have top NaN and ratio 1."""
-    axes = tuple(range(1, llr.ndim))
-    top = llr.max(axis=axes, keepdims=True)
-    scale = np.where(top > bound, bound / np.where(top > 0, top, 1.0), 1.0)
-    ratio = np.exp((llr - top) * scale)
-    return np.nan_to_num(ratio, nan=1.0), top * scale
+    """exp(llr − max) and the log at which the maximum counts, at most `bound`; tiles without data are 1 and NaN."""
+    top = llr.max(axis=tuple(range(1, llr.ndim)), keepdims=True)
+    ratio = np.exp(llr - top)
+    return np.nan_to_num(ratio, nan=1.0), np.minimum(top, bound)
 
 
 def _mixed(ratio: np.ndarray, top: np.ndarray, probability: float) -> np.ndarray:
@@ -360,7 +389,14 @@ def _polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) 
     return np.ascontiguousarray(laid, dtype=np.float32), step
 
 
-def _student(rng: np.random.Generator, mean: np.ndarray, cov: np.ndarray, count: int, seen: np.ndarray, dof: float = 5.0):
+def _student(
+    rng: np.random.Generator,
+    mean: np.ndarray,
+    cov: np.ndarray,
+    count: int,
+    seen: np.ndarray,
+    dof: float = 5.0,
+):
     """Draws from a multivariate t over the parameters that are seen, and the log density of each."""
     d = int(seen.sum())
     root = np.linalg.cholesky(cov[np.ix_(seen, seen)] * 1.5)
@@ -370,7 +406,12 @@ def _student(rng: np.random.Generator, mean: np.ndarray, cov: np.ndarray, count:
     points[:, 2] %= 360.0
     from scipy.special import gammaln
 
-    constant = gammaln((dof + d) / 2) - gammaln(dof / 2) - 0.5 * d * np.log(dof * np.pi) - np.log(np.diag(root)).sum()
+    constant = (
+        gammaln((dof + d) / 2)
+        - gammaln(dof / 2)
+        - 0.5 * d * np.log(dof * np.pi)
+        - np.log(np.diag(root)).sum()
+    )
     return points, constant - 0.5 * (dof + d) * np.log1p((z**2).sum(axis=1) / dof)
 
 
@@ -394,4 +435,6 @@ def _near(index: Any, reach: int, count: int) -> np.ndarray:
 
 
 def _blind(sees_course: bool) -> str:
-    return "grid search, no range maps" if sees_course else "grid search, no azimuth maps: course not observed"
+    return (
+        "grid search, no range maps" if sees_course else "grid search, no azimuth maps: course not observed"
+    )

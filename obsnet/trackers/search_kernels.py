@@ -27,24 +27,47 @@ def _emitted(heard, cpa_range, speed, delay, delay_step):
 
 
 @njit(cache=True, nogil=True)
-def tabulate(offset, cpa_range, speed, delay, delay_step, distance, rate, bearing):
-    """Range [m], range rate [m/s] and azimuth minus course [deg] for every (CPA range, speed, time heard after CPA).
+def tabulate(
+    offset,
+    cpa_range,
+    speed,
+    delay,
+    delay_step,
+    geometry,
+    azimuth_step,
+    course_start,
+    phases,
+    length,
+    across,
+    along,
+    row,
+):
+    """Where each (CPA range, speed, time heard after CPA) reads the score maps.
 
-    Outputs are (n_cpa_range, n_speed, n_offset) float32, overwritten.
+    Parameters
+    ----------
+    offset : time heard after CPA [s]. delay : travel time [s] every `delay_step` m of range.
+    geometry : range origin, range step, rate origin, rate step of the range scores.
+    azimuth_step, course_start : deg. phases, length : layout of the azimuth rows (see `sum_scores`).
+    across, along : (n_cpa_range, n_speed, n_offset) float32, overwritten with positions on the range and rate axes.
+    row : the same shape, int32, overwritten with the start of the courses in the flattened azimuth row.
     """
+    bins = int(round(360.0 / azimuth_step))
     for i in range(cpa_range.shape[0]):
         for j in range(speed.shape[0]):
             for k in range(offset.shape[0]):
                 emitted = _emitted(offset[k], cpa_range[i], speed[j], delay, delay_step)
-                along = speed[j] * emitted
-                r = np.sqrt(cpa_range[i] * cpa_range[i] + along * along)
-                distance[i, j, k] = r
-                rate[i, j, k] = speed[j] * along / max(r, 1.0)
-                bearing[i, j, k] = np.rad2deg(np.arctan2(cpa_range[i], along))
+                path = speed[j] * emitted
+                r = np.sqrt(cpa_range[i] * cpa_range[i] + path * path)
+                across[i, j, k] = (r - geometry[0]) / geometry[1]
+                along[i, j, k] = (speed[j] * path / max(r, 1.0) - geometry[2]) / geometry[3]
+                azimuth = np.rad2deg(np.arctan2(cpa_range[i], path)) + course_start
+                c = int(np.floor(azimuth / azimuth_step + 0.5)) % bins
+                row[i, j, k] = (c % phases) * length + c // phases
 
 
 @njit(cache=True, nogil=True)
-def sum_scores(index, distance, rate, bearing, range_score, geometry, azimuth_score, azimuth_step, course_start, out):
+def sum_scores(index, across, along, row, range_score, azimuth_score, jointly, out):
     """Score of every (CPA time, CPA range, speed, course): the greatest sum over any run of consecutive tiles.
 
     The best run is the stretch over which the hypothesis is heard; a ship need not be heard for the whole segment.
@@ -52,46 +75,61 @@ def sum_scores(index, distance, rate, bearing, range_score, geometry, azimuth_sc
     Parameters
     ----------
     index : (n_cpa_time, n_tiles) position of each tile on the offset axis of the tables.
-    distance, rate, bearing : tables of `tabulate`.
-    range_score : (n_tiles, n_range, n_rate); geometry : range origin, range step, rate origin, rate step. Off the grid is 0.
-    azimuth_score : (n_tiles, n_phases, length) polyphase rows: azimuth bin b is [b % n_phases, b // n_phases], wrapped on so
-        that the courses of one hypothesis lie side by side.
+    across, along, row : tables of `tabulate`.
+    range_score : (n_tiles, n_range, n_rate); off the grid is 0.
+    azimuth_score : (n_tiles, n_phases · length) polyphase rows: azimuth bin b is at (b % n_phases, b // n_phases), wrapped on
+        so that the courses of one hypothesis lie side by side.
+    jointly : range speaks for a hypothesis only in tiles where azimuth does too.
     out : (n_cpa_time, n_cpa_range, n_speed, n_course) float32, overwritten.
     """
     n_tiles = index.shape[1]
     n_range, n_rate = range_score.shape[1], range_score.shape[2]
-    phases = azimuth_score.shape[1]
-    bins = int(round(360.0 / azimuth_step))
     n_course = out.shape[3]
     run = np.empty(n_course, np.float32)
+    best = np.empty(n_course, np.float32)
+    one, zero = np.float32(1.0), np.float32(0.0)
     for t in range(out.shape[0]):
         for i in range(out.shape[1]):
             for j in range(out.shape[2]):
-                row = out[t, i, j]
-                row[:] = 0.0
-                run[:] = 0.0
+                best[:] = zero
+                run[:] = zero
                 for m in range(n_tiles):
                     k = index[t, m]
-                    share = np.float32(0.0)
-                    x = (distance[i, j, k] - geometry[0]) / geometry[1]
-                    y = (rate[i, j, k] - geometry[2]) / geometry[3]
-                    a, b = int(np.floor(x)), int(np.floor(y))
-                    if a >= 0 and b >= 0 and a < n_range - 1 and b < n_rate - 1:
-                        u, v = np.float32(x - a), np.float32(y - b)
-                        share = (1 - u) * (
-                            (1 - v) * range_score[m, a, b] + v * range_score[m, a, b + 1]
-                        ) + u * ((1 - v) * range_score[m, a + 1, b] + v * range_score[m, a + 1, b + 1])
-                    azimuth = bearing[i, j, k] + course_start
-                    c = int(np.round(azimuth / azimuth_step)) % bins
-                    source = azimuth_score[m, c % phases]
-                    first = c // phases
+                    x, y = across[i, j, k], along[i, j, k]
+                    share = zero
+                    if x >= zero and y >= zero:
+                        a, b = int(x), int(y)
+                        if a < n_range - 1 and b < n_rate - 1:
+                            u, v = x - np.float32(a), y - np.float32(b)
+                            share = (one - u) * (
+                                (one - v) * range_score[m, a, b] + v * range_score[m, a, b + 1]
+                            ) + u * ((one - v) * range_score[m, a + 1, b] + v * range_score[m, a + 1, b + 1])
+                    alone = min(share, zero) if jointly else share
+                    source = azimuth_score[m]
+                    first = row[i, j, k]
                     for q in range(n_course):
-                        run[q] = max(run[q] + share + source[first + q], np.float32(0.0))
-                        row[q] = max(row[q], run[q])
+                        pointing = source[first + q]
+                        total = run[q] + pointing + (share if pointing > zero else alone)
+                        total = total if total > zero else zero
+                        run[q] = total
+                        best[q] = total if total > best[q] else best[q]
+                out[t, i, j] = best
 
 
 @njit(cache=True, nogil=True)
-def score_points(points, tiles, delay, delay_step, range_score, geometry, azimuth_score, azimuth_step, per_tile, out):
+def score_points(
+    points,
+    tiles,
+    delay,
+    delay_step,
+    range_score,
+    geometry,
+    azimuth_score,
+    azimuth_step,
+    jointly,
+    per_tile,
+    out,
+):
     """Score of each hypothesis of a list (as in `sum_scores`), both maps interpolated linearly.
 
     Parameters
@@ -122,7 +160,10 @@ def score_points(points, tiles, delay, delay_step, range_score, geometry, azimut
             z = ((course + np.rad2deg(np.arctan2(cpa_range, along))) % 360.0) / azimuth_step
             c = int(np.floor(z))
             w = z - c
-            share += (1 - w) * azimuth_score[m, c % bins] + w * azimuth_score[m, (c + 1) % bins]
+            pointing = (1 - w) * azimuth_score[m, c % bins] + w * azimuth_score[m, (c + 1) % bins]
+            if jointly and pointing <= 0:
+                share = min(share, 0.0)
+            share += pointing
             if per_tile.shape[1] > p:
                 per_tile[m, p] = share
             run = max(run + share, 0.0)

@@ -69,7 +69,10 @@ class Track:
         }
         if not np.isfinite(std[2]):
             values["cpa_azimuth_deg"] = values["course_deg"] = np.nan
-        return {key: np.nan if isinstance(value, float) and np.isinf(value) else value for key, value in values.items()}
+        return {
+            key: np.nan if isinstance(value, float) and np.isinf(value) else value
+            for key, value in values.items()
+        }
 
     def positions(self, step_s: float = 60.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (`datetime64`), east and north [m] along the track, every `step_s` from start to end."""

@@ -1,0 +1,166 @@
+"""Grid search: known courses come back, on the right side, where the ship was; nothing comes from nothing."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from obsnet.kinematics import StraightCourse, wrap180
+from obsnet.layout import from_posix
+from obsnet.trackers.grid_search import GridSearchConfig, search
+from obsnet.trackers.track import Segment
+
+T0 = 1_369_123_200.0
+AZIMUTH = np.arange(0.0, 360.0)
+RANGE = 70.0 * np.arange(715)
+RATE = 0.5 * np.arange(-26, 27)
+
+
+def delay(range_m):
+    """Travel time of the second path in 4340 m of water of 1500 m/s."""
+    return np.hypot(range_m, 3 * 4340.0) / 1500.0
+
+
+def heard(course, times):
+    emitted = np.array(times, float)
+    for _ in range(20):
+        emitted = times - delay(course.observables(emitted)[1])
+    return course.observables(emitted)
+
+
+def maps_of(courses, minutes, rng, azimuth_std=3.0, range_std=250.0, strength=8.0, miss=0.15, ghosts=True):
+    """Maps with one blob per ship and minute, scattered, missed now and then, with a ghost range branch."""
+    azimuth_llr = -2.0 + 0.3 * rng.standard_normal((len(minutes), 360))
+    range_llr = -1.0 + 0.3 * rng.standard_normal((len(minutes), len(RANGE), len(RATE)))
+    for course in courses:
+        azimuth, distance, rate = heard(course, minutes)
+        for m in range(len(minutes)):
+            if rng.random() > miss and distance[m] < 90_000:
+                seen = azimuth[m] + azimuth_std * rng.standard_normal()
+                azimuth_llr[m] += (strength + 2) * np.exp(-0.5 * (wrap180(AZIMUTH - seen) / azimuth_std) ** 2)
+            if 7_000 < distance[m] < 45_000 and rng.random() > miss:
+                seen = distance[m] + 0.3 * range_std * rng.standard_normal()
+                speed = np.exp(-0.5 * ((RATE - rate[m]) / 0.7) ** 2)
+                for where in (seen, 0.6 * seen)[: 2 if ghosts else 1]:
+                    blob = np.exp(-0.5 * ((RANGE - where) / range_std) ** 2)
+                    range_llr[m] += (strength + 1) * blob[:, None] * speed
+    return xr.Dataset(
+        {
+            "azimuth_llr": (("time", "azimuth"), azimuth_llr.astype(np.float32)),
+            "range_llr": (("time", "range", "range_rate"), range_llr.astype(np.float32)),
+            "azimuth_coverage": ("time", np.ones(len(minutes), np.float32)),
+            "range_coverage": ("time", np.ones(len(minutes), np.float32)),
+        },
+        coords={"time": from_posix(minutes), "azimuth": AZIMUTH, "range": RANGE, "range_rate": RATE},
+    )
+
+
+MINUTES = T0 + 60.0 * np.arange(240)
+SEGMENT = Segment(MINUTES[0], MINUTES[-1], T0 + 7200.0)
+
+
+@pytest.mark.parametrize(
+    ("cpa_range", "course"), [(10_000.0, 5.0), (-10_000.0, 122.0), (4_000.0, 122.0), (-25_000.0, 5.0), (9_000.0, 263.0)]
+)
+def test_known_course_comes_back_on_its_side(cpa_range, course):
+    truth = StraightCourse(T0 + 7000.0, cpa_range, course, 8.3)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(int(abs(cpa_range) + course)))
+    segment = SEGMENT if course < 200 else Segment(MINUTES[0], MINUTES[-1], None)
+    (found, *_) = search(maps, segment, delay)
+    assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
+    assert abs(found.motion.cpa_range_m - cpa_range) < 400.0
+    assert abs(wrap180(found.motion.course_deg - course)) < 2.0
+    assert abs(found.motion.speed_mps - 8.3) < 0.2
+    assert found.log_bayes_factor > 50.0
+
+
+def test_one_ship_gives_one_track_and_ghosts_none():
+    truth = StraightCourse(T0 + 7000.0, 12_000.0, 60.0, 9.0)
+    tracks = search(maps_of([truth], MINUTES, np.random.default_rng(2)), SEGMENT, delay)
+    assert len(tracks) == 1
+
+
+def test_two_ships_at_once_are_two_tracks():
+    ships = [
+        StraightCourse(T0 + 6000.0, 12_000.0, 60.0, 9.0),
+        StraightCourse(T0 + 9000.0, -18_000.0, 240.0, 7.0),
+    ]
+    tracks = search(maps_of(ships, MINUTES, np.random.default_rng(3)), SEGMENT, delay)
+    assert len(tracks) == 2
+    for ship in ships:
+        assert (
+            min(
+                abs(t.motion.cpa_time - ship.cpa_time) + abs(t.motion.cpa_range_m - ship.cpa_range_m)
+                for t in tracks
+            )
+            < 600
+        )
+
+
+def test_no_ship_gives_no_track():
+    assert search(maps_of([], MINUTES, np.random.default_rng(4)), SEGMENT, delay) == []
+
+
+def test_travel_time_is_undone():
+    """Without the delay the CPA comes out late by a travel time, of the CPA's range at least."""
+    truth = StraightCourse(T0 + 7000.0, 12_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(5), miss=0.0, azimuth_std=1.0, range_std=150.0)
+    with_delay = search(maps, SEGMENT, delay)[0].motion.cpa_time
+    without = search(maps, SEGMENT, lambda r: np.zeros_like(r))[0].motion.cpa_time
+    assert abs(with_delay - truth.cpa_time) < 5.0
+    assert delay(12_000.0) < without - with_delay < delay(60_000.0)
+
+
+def test_ship_heard_for_part_of_the_segment_has_that_extent():
+    truth = StraightCourse(T0 + 4000.0, 9_000.0, 300.0, 8.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(6))
+    silent = slice(150, None)
+    maps["azimuth_llr"][silent] = -2.0
+    maps["range_llr"][silent] = -1.0
+    (found, *_) = search(maps, SEGMENT, delay)
+    assert found.end == pytest.approx(MINUTES[150], abs=600.0)
+    assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
+
+
+def test_covariance_covers_the_errors():
+    """Errors over many passages stay within what the covariance says: the mean squared normalised error is near 4."""
+    squared = []
+    for seed in range(8):
+        rng = np.random.default_rng(100 + seed)
+        truth = StraightCourse(T0 + rng.uniform(5000, 9000), rng.choice([-1, 1]) * rng.uniform(5e3, 2e4),
+                               rng.uniform(0, 360), rng.uniform(5, 11))  # fmt: skip
+        (found, *_) = search(maps_of([truth], MINUTES, rng, ghosts=False), SEGMENT, delay)
+        m = found.motion
+        error = np.array([m.cpa_time - truth.cpa_time, m.cpa_range_m - truth.cpa_range_m,
+                          wrap180(m.course_deg - truth.course_deg), m.speed_mps - truth.speed_mps])  # fmt: skip
+        squared.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.median(squared) < 12.0
+    assert all(np.isfinite(squared))
+
+
+def test_range_alone_finds_the_passage_but_no_course():
+    truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(8)).drop_vars(
+        ["azimuth_llr", "azimuth_coverage", "azimuth"]
+    )
+    (found, *_) = search(maps, SEGMENT, delay)
+    assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
+    assert abs(found.motion.cpa_range_m) == pytest.approx(10_000.0, abs=400.0)
+    assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
+
+
+def test_missing_minutes_say_nothing():
+    truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(9))
+    maps["azimuth_llr"][90:130] = np.nan
+    maps["range_llr"][60:150] = np.nan
+    (found, *_) = search(maps, SEGMENT, delay)
+    assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
+
+
+def test_search_keeps_the_best_of_its_grid():
+    """The best score is that of a slow scan over the finest grid around the truth, never below it."""
+    truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(10))
+    few = search(maps, SEGMENT, delay, GridSearchConfig(candidates=1))[0]
+    many = search(maps, SEGMENT, delay, GridSearchConfig(candidates=8))[0]
+    assert many.extra["score"] >= few.extra["score"] - 1e-6

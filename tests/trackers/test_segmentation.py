@@ -1,0 +1,83 @@
+"""Segmentation: presence over hours becomes segments, a departure before an approach splits them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from obsnet.errors import ConfigError
+from obsnet.trackers.segmentation import SegmentationConfig, mixture, segments
+
+T0 = 1_369_123_200.0
+
+
+def presence(count=1440, ships=(), rng=None):
+    """Minutes of presence; a ship is (start, cpa, end) in minutes, closing before its CPA and opening after."""
+    rng = rng or np.random.default_rng(0)
+    table = pd.DataFrame(
+        {
+            name: -6.0 + 0.5 * rng.standard_normal(count)
+            for name in ("azimuth", "range", "approaching", "leaving")
+        },
+        index=T0 + 60.0 * np.arange(count),
+    )
+    for start, cpa, end in ships:
+        table.iloc[start:end, 0] = 20.0
+        table.iloc[start + 30 : end - 30, 1] = 8.0
+        table.iloc[start + 30 : cpa, 2] = 8.0
+        table.iloc[cpa : end - 30, 3] = 8.0
+    return table
+
+
+def test_one_ship_is_one_segment_with_its_cpa():
+    (segment,) = segments(presence(ships=[(400, 600, 800)]))
+    assert segment.start == pytest.approx(T0 + 60 * 400, abs=60 * 45)
+    assert segment.end == pytest.approx(T0 + 60 * 800, abs=60 * 45)
+    assert segment.cpa == pytest.approx(T0 + 60 * 600, abs=60 * 10)
+
+
+def test_departure_before_an_approach_splits():
+    first, second = segments(presence(ships=[(200, 350, 500), (500, 650, 800)]))
+    assert first.end == second.start == pytest.approx(T0 + 60 * 500, abs=60 * 20)
+    assert first.cpa == pytest.approx(T0 + 60 * 350, abs=600)
+    assert second.cpa == pytest.approx(T0 + 60 * 650, abs=600)
+
+
+def test_silence_is_no_segment():
+    assert segments(presence()) == []
+
+
+def test_one_loud_minute_cannot_make_a_segment():
+    table = presence()
+    table.iloc[700] = 500.0
+    assert segments(table) == []
+
+
+def test_shorter_than_an_hour_is_dropped():
+    config = SegmentationConfig(azimuth_average_min=10, range_average_min=10)
+    assert segments(presence(ships=[(400, 420, 440)]), config) == []
+    assert len(segments(presence(ships=[(400, 500, 600)]), config)) == 1
+
+
+def test_missing_data_says_nothing():
+    table = presence(ships=[(400, 600, 800)])
+    table.iloc[580:620] = np.nan
+    assert len(segments(table)) == 1
+    table.iloc[:] = np.nan
+    assert segments(table) == []
+
+
+def test_azimuth_alone_makes_segments_without_cpa():
+    table = presence(ships=[(400, 600, 800)])[["azimuth"]]
+    (segment,) = segments(table)
+    assert segment.cpa is None
+
+
+def test_mixture_is_bounded_below_by_a_miss():
+    assert mixture(np.array([-1e3]), 0.9)[0] == pytest.approx(np.log(0.1))
+    assert mixture(np.array([0.0]), 0.6)[0] == pytest.approx(0.0, abs=1e-12)
+    assert mixture(np.array([np.nan]), 0.6)[0] == 0.0
+
+
+def test_wrong_probability_is_refused():
+    with pytest.raises(ConfigError, match="azimuth_detection_probability"):
+        SegmentationConfig(azimuth_detection_probability=1.0)
