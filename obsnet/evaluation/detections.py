@@ -116,9 +116,7 @@ def compare(
 def _errors(
     estimates: np.ndarray, truth: np.ndarray, criteria: DetectionCriteria
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Errors (azimuth, range, range rate) that count for a ship, NaN elsewhere; where azimuth and range are
-    right.
-    """
+    """Errors that count for a ship, NaN elsewhere; where azimuth and range are right."""
     errors = estimates - truth
     half = criteria.azimuth_period_deg / 2
     errors[0] = (errors[0] + half) % (2 * half) - half
