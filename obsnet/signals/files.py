@@ -9,7 +9,7 @@ import glob
 import re
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,22 +25,30 @@ from obsnet.signals.station import Station
 from obsnet.signals.timeline import Piece
 
 _DAY_NS = 86_400_000_000_000
+_OTHER_SUFFIXES = frozenset(
+    (".xml", ".csv", ".json", ".geojson", ".nc", ".png", ".pdf", ".svg", ".html", ".md")
+    + (".yaml", ".yml", ".toml", ".onnx", ".zst", ".pickle", ".pkl")
+)
 _SDS_FILE = re.compile(r"^([^.]+)\.([^.]+)\.([^.]*)\.([^.]+)\.[A-Z]\.(\d{4})\.(\d{3})$")
 
 
-def list_files(paths: list[Any], station: Station, begin: int | None, end: int | None) -> Iterator[Path]:
+def list_files(
+    paths: list[str | Path], station: Station, begin: int | None, end: int | None
+) -> Iterator[Path]:
     """Every file once, in order; in an SDS archive only the station's days."""
     seen: set[Path] = set()
     for item in paths:
         path = Path(item)
         if path.is_dir():
-            found: Iterable[Path] = _list_folder(path, station, begin, end)
+            try:
+                found = _list_folder(path, station, begin, end)
+            except OSError as error:
+                raise WaveformError(f"cannot read the folder {path}: {error.strerror}") from None
         elif path.exists():
             found = [path]
         else:
-            found = [
-                Path(match) for match in sorted(glob.glob(str(item), recursive=True)) if Path(match).is_file()
-            ]
+            found = [Path(match) for match in sorted(glob.glob(str(item), recursive=True))]
+            found = [match for match in found if match.is_file()]
             if not found:
                 raise WaveformError(f"there is no file, folder or archive {item}; check the path")
         for file in found:
@@ -50,15 +58,25 @@ def list_files(paths: list[Any], station: Station, begin: int | None, end: int |
                 yield file
 
 
-def _list_folder(folder: Path, station: Station, begin: int | None, end: int | None) -> Iterator[Path]:
+def _list_folder(folder: Path, station: Station, begin: int | None, end: int | None) -> list[Path]:
     network, _, name = station.code.partition(".")
     years = [sub for sub in sorted(folder.iterdir()) if sub.is_dir() and re.fullmatch(r"\d{4}", sub.name)]
-    own = [year / network / name for year in years if (year / network / name).is_dir()]
-    for root in own or [folder]:
+    roots = [year / network / name for year in years if (year / network / name).is_dir()]
+    if years and not roots:
+        held = {
+            f"{sub.parent.parent.name}.{sub.parent.name}" for year in years for sub in year.glob("*/*/*.D")
+        }
+        if held:
+            found = ", ".join(sorted(held)[:8])
+            raise WaveformError(f"the archive {folder} holds no waveforms of {station.code}; it has {found}")
+    listed = []
+    for root in roots or [folder]:
         for file in sorted(root.rglob("*")):
             hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-            if file.is_file() and not hidden and _day_overlaps(file.name, begin, end):
-                yield file
+            other = hidden or file.suffix.lower() in _OTHER_SUFFIXES
+            if not other and file.is_file() and _day_overlaps(file.name, begin, end):
+                listed.append(file)
+    return listed
 
 
 def _day_overlaps(name: str, begin: int | None, end: int | None) -> bool:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import scipy.fft
 
-_GRID_TOLERANCE = 1e-4
+_GRID_TOLERANCE = 1e-5
 _MIN_LEVELS = 32
 _NEAR = 0.02
 _PILED = 3.0
@@ -16,8 +16,8 @@ _PILED = 3.0
 class FrameTransform:
     """Hann-windowed Fourier transform of frames at one sampling rate, at multiples of 1 / `window_s`.
 
-    An FFT cut at the last bin asked for, where the window holds a whole number of samples (to 1e-4, a tenth
-    of a bin at the top); else a chirp-z transform, which is the same sum at the same frequencies.
+    An FFT cut at the last bin asked for, where the window holds a whole number of samples (to 1e-5, a
+    hundredth of a bin at the top); else a chirp-z transform, the same sum at the same frequencies.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class FrameTransform:
         self.count = math.ceil(exact) if self._chirp else round(exact)
         period = exact if self._chirp else float(self.count)
         self.middle_s = self.count // 2 * window_s / period
-        window = np.sin(np.pi * np.arange(self.count) / period) ** 2
-        self._window = window.astype(np.float32)
-        self.scale = np.full(bins, 2 / window.sum())
+        self._window = np.sin(np.pi * np.arange(self.count) / period) ** 2
+        self._weight = self._window.sum()
+        self.scale = np.full(bins, 2 / self._weight)
         self.scale[0] /= 2
         if self.count == 2 * (bins - 1):
             self.scale[-1] /= 2
@@ -57,24 +57,28 @@ class FrameTransform:
     def _prepare_chirp(self, period: float) -> None:
         n = np.arange(max(self.count, self.bins), dtype=float)
         quadratic = np.exp(-1j * np.pi * (n**2 / period % 2))
-        self._up, self._down = quadratic[: self.count], quadratic[: self.bins]
+        self._up = quadratic[: self.count].astype(np.complex64)
+        self._down = quadratic[: self.bins].astype(np.complex64)
         self._size = scipy.fft.next_fast_len(self.count + self.bins - 1)
         kernel = np.zeros(self._size, complex)
-        kernel[: self.bins] = np.conj(self._down)
-        kernel[-(self.count - 1) :] = np.conj(self._up[:0:-1])
-        self._kernel = scipy.fft.fft(kernel)
+        kernel[: self.bins] = np.conj(quadratic[: self.bins])
+        kernel[-(self.count - 1) :] = np.conj(quadratic[self.count - 1 : 0 : -1])
+        self._kernel = scipy.fft.fft(kernel).astype(np.complex64)
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Spectra (frame, bin) complex64 of frames (frame, sample), their means removed."""
-        frames -= frames.mean(axis=1, keepdims=True)
-        windowed = np.multiply(frames, self._window, dtype=np.float64).astype(np.float32)
+        """Spectra (frame, bin) complex64 of frames (frame, sample) float64, which are overwritten.
+
+        Each frame's windowed mean is removed, which leaves nothing at 0 Hz; a plain mean would put a loud tone's
+        unfinished cycle into the lowest bins.
+        """
+        frames -= (frames @ self._window / self._weight)[:, None]
+        frames *= self._window
+        windowed = frames.astype(np.float32)
         if not self._chirp:
             return scipy.fft.rfft(windowed, axis=1)[:, : self.bins]
         # Bluestein: kn = (k² + n² − (k − n)²) / 2 turns the sum into a convolution
         mixed = scipy.fft.fft(windowed * self._up, self._size, axis=1)
-        return (scipy.fft.ifft(mixed * self._kernel, axis=1)[:, : self.bins] * self._down).astype(
-            np.complex64
-        )
+        return scipy.fft.ifft(mixed * self._kernel, axis=1)[:, : self.bins] * self._down
 
 
 def constant(samples: np.ndarray, count: int) -> np.ndarray:

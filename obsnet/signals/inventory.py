@@ -25,7 +25,7 @@ def read(source: Any) -> Any:
         if hasattr(source, "networks"):
             return source
         raise StationError(
-            f"a station needs a StationXML path or an obspy Inventory, found a {type(source).__name__}"
+            f"a station needs a StationXML path or an obspy Inventory, found {type(source).__name__}"
         )
     try:
         content = Path(source).read_bytes()

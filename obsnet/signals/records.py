@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -58,17 +59,19 @@ class RecordFile:
 
 
 class RecordReader:
-    """Reads pieces out of miniSEED files, keeping the tables of the last few files.
+    """Reads pieces out of miniSEED files, keeping the tables of the last few.
 
-    Attributes
+    Parameters
     ----------
-    damaged : int
-        Records that could not be decoded; their samples are NaN.
+    note : callable, optional
+        Is told of records that do not decode; their samples are NaN.
+    files : int
+        Tables to keep.
     """
 
-    def __init__(self, files: int = 8) -> None:
+    def __init__(self, note: Callable[[str], None] | None = None, files: int = 8) -> None:
         self._index = lru_cache(maxsize=files)(scan)
-        self.damaged = 0
+        self._note = note
 
     def pieces(self, path: Path) -> tuple[list[tuple[str, Piece]], RecordFile] | None:
         """Every unbroken stretch of every channel; None unless miniSEED with records of one length."""
@@ -110,7 +113,10 @@ class RecordReader:
         ):  # obspy raises what its C library reports; the halves below find the record at fault
             pass
         if table.size == 1:
-            self.damaged += 1
+            if self._note is not None:
+                self._note(
+                    f"{path.name}: record {int(table['row'][0])} does not decode; its samples are missing"
+                )
             return np.full(expected, np.nan, np.float32)
         middle = table.size // 2
         halves = (self._decode(path, length, half) for half in (table[:middle], table[middle:]))

@@ -3,14 +3,14 @@
 One definition serves every sampling rate. A frame is a span of `window_s` seconds; its value at f_k = k /
 window_s is
 
-    S(f_k) = 2 / Σw · Σ_n w(t_n) (x_n − mean) exp(−2πi f_k t_n) / R(f_k),   w(t) = sin²(πt / window_s),
+    S(f_k) = 2 / Σw · Σ_n w(t_n) (x_n − x̄) exp(−2πi f_k t_n) / R(f_k),   w(t) = sin²(πt / window_s),
 
-with t_n the samples' own times after the frame's start and R the channel's response, so that a tone of
-amplitude A gives |S| = A. Rates above the analysis rate are not decimated: their longer FFT is cut at half
-the analysis rate, which is a filter without a transition band, and leaves the bins below it as a station at
-the analysis rate would have them. At 50, 62.5, 100, 125, 200, 250 Hz the sum is an FFT; at a rate that
-gives no whole number of samples it is a chirp-z transform. A start off the sampling grid, or a drifting
-clock, is a phase: frames take the nearest samples and turn it back.
+with t_n the samples' own times after the frame's start, x̄ their w-weighted mean and R the channel's
+response, so that a tone of amplitude A gives |S| = A. Rates above the analysis rate are not decimated:
+their longer FFT is cut at half the analysis rate. That is a filter without a transition band, and leaves
+the bins below as a station at the analysis rate would have them. At 50, 62.5, 100, 125, 200, 250 Hz the sum
+is an FFT; at a rate that gives no whole number of samples it is a chirp-z transform. A start off the
+sampling grid, or a drifting clock, is a phase: frames take the nearest samples and turn it back.
 """
 
 from __future__ import annotations

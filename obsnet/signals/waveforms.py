@@ -46,10 +46,11 @@ class ChannelReport:
 
 @dataclass
 class WaveformReport:
-    """What was read, what was left aside and why; plain values for `run.json`."""
+    """What was read, which files and channels were left aside and why; plain values for `run.json`."""
 
     files: int = 0
     ignored: dict[str, str] = field(default_factory=dict)
+    left_aside: dict[str, str] = field(default_factory=dict)
     channels: dict[str, ChannelReport] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -93,10 +94,8 @@ class WaveformSource:
         self.end_ns = last if end_ns is None else end_ns
         self.data_begin_ns, self.data_end_ns = first, last
         if self.begin_ns >= last or self.end_ns <= first:
-            raise WaveformError(
-                f"{station.code} has no waveforms between {_iso(self.begin_ns)} and {_iso(self.end_ns)}; "
-                f"they span {_iso(first)} to {_iso(last)}"
-            )
+            found = f"they span {_iso(first)} to {_iso(last)}"
+            raise WaveformError(f"{station.code} has no waveforms {_span(begin_ns, end_ns)}; {found}")
 
     def station_at(self, time_ns: int) -> Station:
         """The station with the channels that have waveforms and an epoch at a time."""
@@ -141,15 +140,19 @@ def open_waveforms(
             f"the start {_iso(begin)} is not before the end {_iso(end)}; swap or correct them"
         )
     if isinstance(source, WaveformSource):
-        return WaveformSource(source.station, source.timelines, source.report, begin, end)
+        return WaveformSource(station, source.timelines, source.report, begin, end)
     report = WaveformReport()
     if isinstance(source, (obspy.Stream, obspy.Trace)):
         what, found = "the stream", _from_stream(source)
     else:
-        paths = [source] if isinstance(source, (str, Path)) else list(source)
+        paths = _paths(source)
         what = ", ".join(str(path) for path in paths[:3]) + (", …" if len(paths) > 3 else "")
         found = _from_files(paths, station, begin, end, report)
-    timelines = _sort(found, station, min_rate_hz, what, report)
+    timelines = _sort(found, station, min_rate_hz, report)
+    if not timelines:
+        raise WaveformError(_nothing(what, station, report, _span(begin, end)))
+    for seed_id, timeline in timelines.items():
+        report.channels[seed_id] = _describe(timeline)
     return WaveformSource(station, timelines, report, begin, end)
 
 
@@ -178,6 +181,26 @@ def _iso(time_ns: int) -> str:
     return iso(np.datetime64(time_ns, "ns"))
 
 
+def _span(begin: int | None, end: int | None) -> str:
+    """The span asked for, in words."""
+    if begin is not None and end is not None:
+        return f"between {_iso(begin)} and {_iso(end)}"
+    return (
+        f"from {_iso(begin)} on"
+        if begin is not None
+        else f"before {_iso(end)}"
+        if end is not None
+        else "at all"
+    )
+
+
+def _paths(source: Any) -> list[str | Path]:
+    paths = [source] if isinstance(source, (str, Path)) else source
+    if not isinstance(paths, (list, tuple)) or not all(isinstance(path, (str, Path)) for path in paths):
+        raise WaveformError(f"obsnet takes paths or an obspy Stream, found {type(source).__name__}")
+    return list(paths)
+
+
 def _from_stream(stream: Any) -> Iterator[tuple[str, Piece]]:
     traces = [stream] if isinstance(stream, obspy.Trace) else list(stream)
     for trace in traces:
@@ -195,7 +218,7 @@ def _slice(data: np.ndarray, first: int, last: int) -> np.ndarray:
 def _from_files(
     paths: list[Any], station: Station, begin: int | None, end: int | None, report: WaveformReport
 ) -> Iterator[tuple[str, Piece]]:
-    records, others = RecordReader(), FileReader()
+    records, others = RecordReader(report.note), FileReader()
     for path in list_files(paths, station, begin, end):
         report.files += 1
         try:
@@ -219,36 +242,22 @@ def _from_files(
 
 
 def _sort(
-    found: Iterable[tuple[str, Piece]],
-    station: Station,
-    min_rate_hz: float,
-    what: str,
-    report: WaveformReport,
+    found: Iterable[tuple[str, Piece]], station: Station, min_rate_hz: float, report: WaveformReport
 ) -> dict[str, Timeline]:
     """Pieces by channel of the station, the unusable ones set aside with a reason."""
     known = {channel.seed_id for channel in station.epochs}
     pieces: dict[str, list[Piece]] = {}
-    foreign: dict[str, str] = {}
     for seed_id, piece in found:
         own = _match(seed_id, known)
         if own is None:
-            foreign[seed_id] = f"not described for {station.code}"
+            report.left_aside[seed_id] = f"not described for {station.code}"
         elif piece.rate < min_rate_hz * (1 - _RATE_TOLERANCE):
-            foreign[seed_id] = (
-                f"sampled at {piece.rate:g} Hz, below the {min_rate_hz:g} Hz that the analysis needs"
-            )
+            report.left_aside[seed_id] = f"sampled at {piece.rate:g} Hz, below the {min_rate_hz:g} Hz needed"
         else:
             if own != seed_id:
                 report.note(f"{seed_id} taken for {own}")
             pieces.setdefault(own, []).append(piece)
-    for seed_id, reason in foreign.items():
-        report.note(f"{seed_id} left aside: {reason}")
-    if not pieces:
-        raise WaveformError(_nothing(what, station, foreign, report))
-    timelines = {seed_id: Timeline(pieces[seed_id]) for seed_id in sorted(pieces)}
-    for seed_id, timeline in timelines.items():
-        report.channels[seed_id] = _describe(timeline)
-    return timelines
+    return {seed_id: Timeline(pieces[seed_id]) for seed_id in sorted(pieces)}
 
 
 def _match(seed_id: str, known: set[str]) -> str | None:
@@ -266,15 +275,17 @@ def _match(seed_id: str, known: set[str]) -> str | None:
     return alike[0] if len(alike) == 1 else None
 
 
-def _nothing(what: str, station: Station, foreign: dict[str, str], report: WaveformReport) -> str:
+def _nothing(what: str, station: Station, report: WaveformReport, span: str) -> str:
     reasons: dict[str, list[str]] = {}
     for path, reason in report.ignored.items():
         reasons.setdefault(reason, []).append(Path(path).name)
     found = [f"{_some(names)}: {reason}" for reason, names in reasons.items()]
-    found += [f"{seed_id} {reason}" for seed_id, reason in list(foreign.items())[:4]]
+    found += [f"{seed_id} {reason}" for seed_id, reason in list(report.left_aside.items())[:4]]
     channels = ", ".join(sorted({channel.seed_id for channel in station.epochs})[:8])
-    inside = "; ".join(found) or ("no files" if not report.files else "no samples")
-    return f"no usable waveforms of {station.code} in {what} (found {inside}); wanted {channels}"
+    inside = "; ".join(found) or (
+        "no samples" if report.files else f"no files {span}".removesuffix(" at all")
+    )
+    return f"no usable waveforms of {station.code} in {what or 'no path'} (found {inside}); wanted {channels}"
 
 
 def _some(names: list[str]) -> str:
