@@ -139,7 +139,7 @@ class Scenario:
         recorder: Recorder | None = None,
         seed: int = 0,
         radius_m: float = 120_000.0,
-        max_gap_s: float = 6 * 3600.0,
+        max_gap_s: float = 24 * 3600.0,
         smooth: bool = False,
         **fixed: object,
     ) -> Scenario:

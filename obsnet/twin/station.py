@@ -4,14 +4,9 @@ ocean-bottom station.
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import pandas as pd
@@ -19,32 +14,36 @@ import xarray as xr
 from obspy import Stream, Trace, UTCDateTime
 from obspy.core.inventory import Inventory
 
-from obsnet.errors import OutputError
-from obsnet.layout import iso
+from obsnet import ais as positions
+from obsnet.errors import AISError, ConfigError
+from obsnet.layout import iso, to_posix
 from obsnet.ocean.rays import propagation_table
+from obsnet.signals.station import Station
 from obsnet.twin.course import Course
+from obsnet.twin.files import WAVEFORMS, append_stream, whole_file, write_tables, writing
+from obsnet.twin.instrument import Recorder
 from obsnet.twin.noise import sample_index
 from obsnet.twin.propagate import OVERSAMPLING, Field, Paths, add_moving_source
-from obsnet.twin.scenario import Passage, Scenario
+from obsnet.twin.scenario import DEFAULT_START, Passage, Scenario
 from obsnet.twin.sea import add_ambient
 from obsnet.twin.seafloor import add_earthquakes, add_tremor
 from obsnet.twin.ship import Emission
 from obsnet.twin.truth import Truth, ais_of, truth_of
 from obsnet.twin.whales import add_whale
 
-__all__ = ["Passage", "Scenario", "Simulation", "simulate", "simulate_blocks", "write_simulation"]
+__all__ = [
+    "Passage",
+    "Scenario",
+    "Simulation",
+    "simulate",
+    "simulate_blocks",
+    "simulate_folder",
+    "write_simulation",
+]
 
 BLOCK_S = 3600.0
 CONTEXT_S = 150.0
-WAVEFORMS, METADATA, AIS, MINUTES, PASSAGES = (
-    "waveforms.mseed",
-    "station.xml",
-    "ais.csv",
-    "truth.csv",
-    "truth.json",
-)
-
-Progress = Callable[[int, int], None]
+Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
@@ -82,12 +81,12 @@ class Simulation:
         OutputError
             The folder cannot be made or written to.
         """
-        with _writing(Path(folder)) as target:
-            with _whole(target / WAVEFORMS) as file:
-                _append(file, self.stream)
+        with writing(Path(folder)) as target:
+            with whole_file(target / WAVEFORMS) as file:
+                append_stream(file, self.stream)
             return [
                 target / WAVEFORMS,
-                *_write_tables(target, self.inventory, self.ais, self.truth, self.scenario),
+                *write_tables(target, self.inventory, self.ais, self.truth, self.scenario),
             ]
 
 
@@ -140,14 +139,103 @@ def write_simulation(
         The folder cannot be made or written to.
     """
     paths = _paths(scenario, table)
-    with _writing(Path(folder)) as target:
-        with _whole(target / WAVEFORMS) as file:
+    with writing(Path(folder)) as target:
+        with whole_file(target / WAVEFORMS) as file:
             for first, block in _counts(scenario, paths, progress):
-                _append(file, _stream(scenario, first, block))
-        tables = _write_tables(
+                append_stream(file, _stream(scenario, first, block))
+        tables = write_tables(
             target, scenario.recorder.inventory(), ais_of(scenario), truth_of(scenario, paths), scenario
         )
         return [target / WAVEFORMS, *tables]
+
+
+def simulate_folder(
+    out: str | Path,
+    hours: float = 8.0,
+    seed: int = 0,
+    ships: int = 1,
+    ais: str | Path | None = None,
+    station: str | Path | None = None,
+    start: str | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Simulate a record into a folder: ships drawn from `seed`, or those of an AIS file on their courses.
+
+    Parameters
+    ----------
+    out : path
+        Folder of `write_simulation`'s files.
+    hours, seed, ships : length of the record, seed of all that is drawn, ships drawn where no AIS is given.
+    ais : path, optional
+        AIS file in any dialect.
+    station : path, optional
+        StationXML whose code, position, depth and orientation to take; station RR03's position by default.
+    start : text, optional
+        ISO 8601 UTC; by default the record is centred on the first closest approach of the AIS.
+
+    Returns
+    -------
+    str
+        What was simulated, for the reader.
+
+    Raises
+    ------
+    ConfigError, AISError, StationError, OutputError
+        A time that cannot be read, AIS without a ship near the station, bad metadata, a folder that cannot be
+        written.
+    """
+    generator = np.random.default_rng([seed, 0x57A])
+    recorder = Recorder.random(generator, **_described(station))  # type: ignore[arg-type]
+    begin = _seconds(start) if start else None
+    if ais is None:
+        scenario = Scenario.random(seed, hours, ships, begin or DEFAULT_START, recorder=recorder)
+    else:
+        scenario = _after_ais(ais, seed, hours, begin, recorder)
+    written = write_simulation(scenario, out, progress=progress)
+    count = len(scenario.passages)
+    return (
+        f"simulated {hours:g} h of {recorder.code} from {iso(scenario.start)} with {count} "
+        f"ship{'' if count == 1 else 's'}: {', '.join(path.name for path in written)} in {out}"
+    )
+
+
+def _described(station: str | Path | None) -> dict[str, object]:
+    if station is None:
+        return {"depth_m": Recorder.depth_m}
+    known = Station.from_stationxml(station)
+    angle = known.orientation_deg
+    place: dict[str, object] = {
+        "code": known.code,
+        "latitude": known.latitude,
+        "longitude": known.longitude,
+        "depth_m": known.depth_m,
+    }
+    return place if angle is None else place | {"orientation_deg": angle}
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(to_posix(np.datetime64(text.removesuffix("Z"), "ns")))
+    except ValueError:
+        raise ConfigError(
+            f"cannot read the start {text!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
+        ) from None
+
+
+def _after_ais(
+    path: str | Path, seed: int, hours: float, start: float | None, recorder: Recorder
+) -> Scenario:
+    place = (recorder.latitude, recorder.longitude)
+    reports = positions.read(path, near=place)
+    if start is None:
+        tracks = positions.reference_tracks(reports, place, max_cpa_m=None)
+        if not tracks:
+            raise AISError(
+                f"no ship of {path} comes within 100 km of {place[0]:g}, {place[1]:g}; give --station"
+            )
+        start = float(np.round(tracks[0].cpa().time / 60.0) * 60.0 - 1800.0 * hours)
+    sea = Scenario.random(seed, hours, 0, start, recorder=recorder)
+    return sea.replace(passages=Scenario.from_ais(reports, start, hours, recorder, seed).passages)
 
 
 def _paths(scenario: Scenario, table: xr.Dataset | None) -> Paths:
@@ -207,64 +295,3 @@ def _stream(scenario: Scenario, first: int, parts: dict[str, np.ndarray]) -> Str
             }
             stream.append(Trace(counts.copy(), header))
     return stream
-
-
-def _append(file: BinaryIO, stream: Stream) -> None:
-    for trace in stream:
-        buffer = BytesIO()
-        trace.write(buffer, format="MSEED", encoding="STEIM2", reclen=4096)
-        file.write(buffer.getvalue())
-
-
-def _write_tables(
-    target: Path, inventory: Inventory, ais: pd.DataFrame, truth: Truth, scenario: Scenario
-) -> list[Path]:
-    stamps = dict.fromkeys(("time", "emitted"), "%Y-%m-%dT%H:%M:%S.%fZ")
-    with _whole(target / METADATA) as file:
-        inventory.write(file, format="STATIONXML")
-    for name, frame in ((AIS, ais), (MINUTES, truth.minutes)):
-        text = frame.copy()
-        for column in stamps.keys() & set(text.columns):
-            text[column] = text[column].dt.strftime(stamps[column]).str.replace(".000000Z", "Z", regex=False)
-        with _whole(target / name) as file:
-            file.write(text.to_csv(index=False, float_format="%.9g").encode())
-    rows = truth.passages.assign(
-        cpa_time=[iso(time) for time in truth.passages["cpa_time"].to_numpy("datetime64[ns]")]
-    )
-    known = {
-        "simulated": True,
-        "station": scenario.recorder.code,
-        "start": iso(scenario.start),
-        "end": iso(scenario.end),
-        "seed": scenario.seed,
-        "orientation_deg": scenario.recorder.orientation_deg,
-        "hydrophone_polarity": scenario.recorder.hydrophone_polarity,
-        "passages": rows.to_dict("records"),
-    }
-    with _whole(target / PASSAGES) as file:
-        file.write(json.dumps(known, indent=2).encode())
-    return [target / name for name in (METADATA, AIS, MINUTES, PASSAGES)]
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[Path]:
-    """Make the output folder; what the system refuses is an `OutputError`."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder
-    except (FileExistsError, NotADirectoryError):
-        raise OutputError(f"cannot write the simulation to {folder}: it is a file, name a folder") from None
-    except OSError as error:
-        raise OutputError(f"cannot write the simulation to {folder}: {error.strerror or error}") from None
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name only when it is complete."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(partial, "wb") as file:
-            yield file
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -140,5 +140,13 @@ def ais_of(scenario: Scenario, interval_s: float = AIS_INTERVAL_S) -> pd.DataFra
                 }
             )
         )
-    columns = ["mmsi", "time", "lon", "lat", "sog", "cog"]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
+    none = np.empty(0)
+    empty = {
+        "mmsi": none.astype(int),
+        "time": from_posix(none),
+        "lon": none,
+        "lat": none,
+        "sog": none,
+        "cog": none,
+    }
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(empty)

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from scipy.signal import welch
 
-from obsnet.errors import ConfigError, OutputError
+from obsnet.errors import AISError, ConfigError, OutputError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import to_posix
 from obsnet.ocean.rays import phase_difference, propagation_table, tdoa
@@ -22,7 +22,14 @@ from obsnet.twin.faults import Faults, Gap
 from obsnet.twin.instrument import Recorder
 from obsnet.twin.sea import Ambient
 from obsnet.twin.ship import Ship
-from obsnet.twin.station import Passage, Scenario, simulate, simulate_blocks, write_simulation
+from obsnet.twin.station import (
+    Passage,
+    Scenario,
+    simulate,
+    simulate_blocks,
+    simulate_folder,
+    write_simulation,
+)
 
 START = 1369130400.0
 OCEAN = OceanConfig(max_range_m=60e3)
@@ -344,3 +351,38 @@ def test_bad_scenarios_are_refused():
         Faults(dead="X")
     with pytest.raises(ConfigError, match="late_s holds a delay"):
         Faults(late_s=(1.0,))
+
+
+def test_a_record_without_ships_has_empty_tables(tmp_path):
+    quiet = simulate(scenario(hours=0.02, passages=()), TABLE)
+    assert len(quiet.truth.minutes) == len(quiet.truth.passages) == len(quiet.ais) == 0
+    quiet.write(tmp_path)
+    assert list(pd.read_csv(tmp_path / "ais.csv").columns) == ["mmsi", "time", "lon", "lat", "sog", "cog"]
+
+
+def test_folder_of_random_ships_and_of_ais(tmp_path):
+    said = simulate_folder(tmp_path / "one", hours=0.2, seed=5, ships=2, start="2014-01-02T03:04:00Z")
+    assert said.startswith(
+        "simulated 0.2 h of XX.SIM01 from 2014-01-02T03:04:00Z with 2 ships: waveforms.mseed"
+    )
+    again = simulate_folder(
+        tmp_path / "two",
+        hours=0.1,
+        seed=5,
+        ais=tmp_path / "one" / "ais.csv",
+        station=tmp_path / "one" / "station.xml",
+    )
+    assert "of XX.SIM01 from 2014-01-02T" in again
+    one, two = (Station.from_stationxml(tmp_path / name / "station.xml") for name in ("one", "two"))
+    assert one.depth_m == two.depth_m == 4340.0 and one.orientation_deg == pytest.approx(two.orientation_deg)
+    truth = json.loads((tmp_path / "two" / "truth.json").read_text())
+    assert {row["mmsi"] for row in truth["passages"]} <= {100000001, 100000002}
+    with pytest.raises(ConfigError, match="cannot read the start 'noon'"):
+        simulate_folder(tmp_path / "three", start="noon")
+
+
+def test_ais_without_a_ship_near_the_station_is_refused(half_hour, tmp_path):
+    half_hour.write(tmp_path)
+    Recorder(latitude=-25.0, longitude=54.0).inventory().write(tmp_path / "far.xml", format="STATIONXML")
+    with pytest.raises(AISError, match=r"no ship of .*ais.csv comes within 100 km of -25, 54"):
+        simulate_folder(tmp_path / "out", ais=tmp_path / "ais.csv", station=tmp_path / "far.xml")
