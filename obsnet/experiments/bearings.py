@@ -74,8 +74,8 @@ def reproduce(
 ) -> Result:
     """Errors of range at CPA and course over `runs` simulated passages at each point of figures 1-3.
 
-    Every point has its own seed, so the result does not depend on `jobs`. `points` are those of `settings()` unless
-    others are given.
+    Every point has its own seed, so the result does not depend on `jobs`. `points` are those of `settings()`
+    unless others are given.
 
     Raises
     ------

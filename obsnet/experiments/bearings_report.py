@@ -104,7 +104,7 @@ def _speeds_said(result: Result) -> list[tuple[str, str]]:
         ),
         (
             "speed errors do not affect heading",
-            f"course RMSE at 2 m/s {_span(worst, 'rmse_course_deg', 'crb_course_deg')} of the bound without them",
+            f"at 2 m/s course {_span(worst, 'rmse_course_deg', 'crb_course_deg')} of the bound without them",
         ),
         (
             "variance d² σ_k² + CRB for ships of scattered speed (eq. 20)",
@@ -127,7 +127,8 @@ def _errors_said(result: Result) -> list[tuple[str, str]]:
             "σ and τ can be measured on vessels with known positions",
             f"{seen['passages']} simulated passages: "
             f"σ {seen['std_deg']:.2f} ± {seen['std_uncertainty_deg']:.2f}° (true {seen['true_std_deg']:g}), "
-            f"τ {seen['correlation_s']:.0f} ± {seen['correlation_uncertainty_s']:.0f} s (true {seen['true_correlation_s']:g})",
+            f"τ {seen['correlation_s']:.0f} ± {seen['correlation_uncertainty_s']:.0f} s "
+            f"(true {seen['true_correlation_s']:g})",
         ),
         ("171 vessels at sea (figures 6, 7)", "not repeated: their bearings are not public"),
     ]

@@ -144,7 +144,10 @@ def _starts(azimuth: np.ndarray, unit_time: np.ndarray, variance: np.ndarray) ->
     cells = start_grid(unit_time)
     weight = variance.min() / variance
     seen = (np.exp(1j * azimuth) * weight).astype(np.complex64)
-    scores = seen @ np.exp(-1j * turn(cells, unit_time)).T.astype(np.complex64)
+    place = np.complex64(1) + (cells[:, 1:] + 1j * cells[:, :1]).astype(np.complex64) * unit_time.astype(
+        np.float32
+    )
+    scores = seen @ (place / np.maximum(np.abs(place), 1e-9)).conj().T
     starts = []
     for side in (-1, 1):
         chosen = np.flatnonzero(np.sign(cells[:, 0]) == side)
@@ -170,8 +173,8 @@ def refine(
         Starts; rad and per unit of `unit_time`.
     azimuth : array (R, K), rad
     unit_time : array (K,)
-    white : array (K, K)
-        Whitens residuals in rad.
+    white : array (K, K) or (K,)
+        Whitens residuals in rad; one row for independent errors.
 
     Returns
     -------
@@ -207,7 +210,7 @@ def refine(
 
 def _residual(polar: np.ndarray, azimuth: np.ndarray, unit_time: np.ndarray, white: np.ndarray) -> np.ndarray:
     difference = azimuth - polar[:, :1] - turn(polar[:, 1:], unit_time)
-    return (np.mod(difference + np.pi, 2 * np.pi) - np.pi) @ white.T
+    return _whiten(np.mod(difference + np.pi, 2 * np.pi) - np.pi, white)
 
 
 def _slopes(polar: np.ndarray, unit_time: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -215,7 +218,11 @@ def _slopes(polar: np.ndarray, unit_time: np.ndarray, white: np.ndarray) -> np.n
     across, along = polar[:, 1:2] * unit_time, 1.0 + polar[:, 2:] * unit_time
     squared = np.maximum(across**2 + along**2, 1e-12)
     slopes = np.stack([np.ones_like(along), unit_time * along / squared, -unit_time * across / squared])
-    return slopes @ white.T
+    return _whiten(slopes, white)
+
+
+def _whiten(values: np.ndarray, white: np.ndarray) -> np.ndarray:
+    return values * white if white.ndim == 1 else values @ white.T
 
 
 def to_theta(polar: np.ndarray, half_s: float, speed: np.ndarray) -> np.ndarray:

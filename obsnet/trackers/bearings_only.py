@@ -1,9 +1,9 @@
 """A ship's course from the station's bearings alone, for when no range was heard.
 
 The errors' covariance is in `bearing_errors`, the geometry and the Cramér-Rao bounds in `bearing_bounds`, the
-maximum-likelihood fit in `bearing_fit` (Urazghildiiev & Hannay). A station's minutes also hold false ones:
-the course is found under a mixture of independent Gaussian errors and a uniform share, the errors' size
-annealed; then what is more probably false is left out and the rest is fitted with its full covariance.
+maximum-likelihood fit in `bearing_fit` (Urazghildiiev & Hannay). A station's minutes also hold false ones.
+The course is found under a mixture of independent Gaussian errors and a uniform share, their size annealed;
+the rest is fitted with its full covariance, without what is more probably false given its neighbours.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from obsnet.trackers.bearing_fit import Fit, centre, refine, start_grid, to_thet
 from obsnet.trackers.track import Track
 
 Delay = Callable[[np.ndarray], np.ndarray]
+MOST_PASSES = 40
+FIXED_ODDS = 3.0
+"""Log odds that a passing ship must have over a fixed direction; noise from one side is common."""
 
 
 def track_bearings(
@@ -33,6 +36,7 @@ def track_bearings(
     speed_std_mps: float,
     delay: Delay | None = None,
     false_share: float = 0.1,
+    white_share: float = 0.1,
     max_range_m: float = 100e3,
 ) -> Track | None:
     """Course of a ship from a station's bearings alone, when no range was heard.
@@ -55,6 +59,8 @@ def track_bearings(
         heard.
     false_share : float
         Share of false bearings, uniform in azimuth, in (0, 1).
+    white_share : float
+        Share of the errors' variance that is not correlated, in [0, 1].
     max_range_m : float
         Prior of the signed CPA range: uniform to this on either side.
 
@@ -71,7 +77,8 @@ def track_bearings(
     LayoutError, ConfigError
         Bearings, times, errors or priors are not what they should be.
     """
-    record = _record(times_s, azimuth_deg, std_deg, correlation_s, false_share)
+    errors = BearingErrors(1.0, correlation_s, nugget=white_share)
+    record = _record(times_s, azimuth_deg, std_deg, errors, false_share)
     _check_prior(speed_mps, speed_std_mps, max_range_m)
     if len(record.time) < 4:
         return None
@@ -88,7 +95,7 @@ def track_bearings(
     volume = 4 * margin * 2 * max_range_m * 360.0
     evidence = log_ratio + 0.5 * np.linalg.slogdet(2 * np.pi * covariance[:3, :3])[1] - np.log(volume)
     fixed = evidence - _fixed_evidence(record)
-    if min(evidence, fixed) <= 0:
+    if evidence <= 0 or fixed <= FIXED_ODDS:
         return None
     scale = np.array([0.0, motion.cpa_range_m / speed_mps, 0.0, 1.0])
     covariance += speed_std_mps**2 * np.outer(scale, scale)
@@ -124,7 +131,7 @@ def _record(
     times_s: np.ndarray,
     azimuth_deg: np.ndarray,
     std_deg: float | np.ndarray,
-    correlation_s: float,
+    errors: BearingErrors,
     false_share: float,
 ) -> _Record:
     time, azimuth = np.asarray(times_s, float), np.asarray(azimuth_deg, float)
@@ -146,7 +153,6 @@ def _record(
         raise LayoutError("two bearings have the same time; keep one bearing for each time")
     if not 0 < false_share < 1:
         raise ConfigError(f"false_share must lie between 0 and 1, found {false_share}")
-    errors = BearingErrors(1.0, correlation_s, nugget=0.01)
     return _Record(time[kept], azimuth[kept], std[kept], kept, errors, false_share)
 
 
@@ -201,27 +207,52 @@ def _robust_fit(
     annealed = [_anneal(record, unit_time, start[None], free) for start in starts]
     polar = annealed[int(np.argmax([score for _, score in annealed]))][0]
     radians = np.deg2rad(record.azimuth)[None]
-    used = np.zeros(len(unit_time), bool)
-    for _ in range(6):
-        previous, used = used, record.true_share(_misfit(polar, radians, unit_time))[0] > 0.5
-        if used.sum() <= free:
+    used = np.flatnonzero(record.true_share(_misfit(polar, radians, unit_time))[0] > 0.5)
+    for _ in range(MOST_PASSES):
+        if len(used) <= free:
             return None
-        if (used == previous).all():
+        white = whitener(record.errors.covariance(record.time[used], record.std[used]))
+        seen, when = radians[:, used], unit_time[used]
+        polar, chi2, _ = refine(polar, seen, when, np.rad2deg(white), free)
+        false = _false_in_context(white, _misfit(polar, seen, when), record, used)
+        fitted, used = used, used[~false]
+        if not false.any():
             break
-        white = np.rad2deg(whitener(record.errors.covariance(record.time[used], record.std[used])))
-        polar, chi2, _ = refine(polar, radians[:, used], unit_time[used], white, free)
-        log_density = np.log(np.diag(white) / np.rad2deg(1) / np.sqrt(2 * np.pi)).sum() - chi2[0] / 2
-        selected = used
-    true, share = int(selected.sum()), record.false_share
-    log_ratio = log_density + true * np.log(360.0 * (1 - share)) + (len(selected) - true) * np.log(share)
-    return polar, selected, float(log_ratio)
+    return polar, fitted, _log_ratio(white, float(chi2[0]), len(unit_time), record.false_share)
+
+
+def _false_in_context(
+    white: np.ndarray, residual: np.ndarray, record: _Record, used: np.ndarray
+) -> np.ndarray:
+    """Bearings that are more probably false, given all others; of neighbours only the worst.
+
+    With Q the inverse covariance, residual r_k less its mean given all others is (Q r)_k / Q_kk, of variance
+    1 / Q_kk. A false bearing near the course stands out against its correlated neighbours long before it does
+    against the course; it also discredits them, which is why they are judged again without it.
+    """
+    inverse = white.T @ white
+    precision = np.diag(inverse)
+    score = 0.5 * (np.log(precision / (2 * np.pi)) - (inverse @ residual) ** 2 / precision)
+    score += np.log((1 - record.false_share) * 360.0 / record.false_share)
+    time, reach = record.time[used], 3.5 * record.errors.correlation_s
+    false = np.zeros(len(used), bool)
+    for worst in np.argsort(score)[: int(np.sum(score < 0))]:
+        false[worst] = not (np.abs(time[false] - time[worst]) <= reach).any()
+    return false
+
+
+def _log_ratio(white: np.ndarray, chi2: float, count: int, false_share: float) -> float:
+    """Log likelihood of true bearings, and of the false ones among `count`, against uniform azimuths."""
+    true = len(white)
+    density = np.log(np.diag(white)).sum() - true * np.log(2 * np.pi) / 2 - chi2 / 2
+    return float(density + true * np.log(360.0 * (1 - false_share)) + (count - true) * np.log(false_share))
 
 
 def _anneal(record: _Record, unit_time: np.ndarray, polar: np.ndarray, free: int) -> tuple[np.ndarray, float]:
     radians = np.deg2rad(record.azimuth)[None]
     for widening in (4.0, 2.0, 1.0, 1.0):
         true = record.true_share(_misfit(polar, radians, unit_time), widening)[0]
-        white = np.diag(np.sqrt(np.maximum(true, 1e-9)) / np.deg2rad(record.std * widening))
+        white = np.sqrt(np.maximum(true, 1e-9)) / np.deg2rad(record.std * widening)
         polar = refine(polar, radians, unit_time, white, free)[0]
     return polar, float(record.true_share(_misfit(polar, radians, unit_time))[1].sum())
 
