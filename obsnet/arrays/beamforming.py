@@ -31,7 +31,7 @@ class HydrophoneArray:
         positions = np.array(self.positions_m, float)
         if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
             raise ConfigError(
-                f"hydrophone positions must have dims (hydrophone, 3) and at least 2 rows, found {positions.shape}"
+                f"positions must have dims (hydrophone, 3), 2 rows at least, found {positions.shape}"
             )
         if not np.isfinite(positions).all():
             raise ConfigError("hydrophone positions must be finite numbers, in metres")
@@ -118,7 +118,8 @@ class Beamformer:
             raise ConfigError(f"a batch needs an even number of samples, at least 2, found {self.nperseg}")
         if not (self.sampling_rate > 0 and self.carrier_hz >= 0):
             raise ConfigError(
-                f"sampling rate must be positive and carrier not negative, found {self.sampling_rate}, {self.carrier_hz} Hz"
+                "the sampling rate must be positive and the carrier not negative, "
+                f"found {self.sampling_rate} and {self.carrier_hz} Hz"
             )
         azimuth = np.atleast_1d(np.asarray(self.azimuth_deg, float))
         object.__setattr__(self, "azimuth_deg", azimuth)
@@ -135,8 +136,7 @@ class Beamformer:
         return np.exp(-2j * np.pi * self.array.delays_s(azimuth_deg)[..., None] * self.frequency_hz)
 
     def steering(self, azimuth_deg: np.ndarray | float) -> np.ndarray:
-        """What a beam is matched to: `phases`, whitened where a `whitening` was given; dims (…, hydrophone,
-        bin)."""
+        """What a beam is matched to, dims (…, hydrophone, bin): `phases`, whitened if asked for."""
         phases = self.phases(azimuth_deg)
         if self.whitening is None:
             return phases

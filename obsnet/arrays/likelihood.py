@@ -1,14 +1,14 @@
 """Beam power of whitened batches in; log-likelihood ratio of a source at an azimuth and SNR out.
 
-The model of a whitened batch z of N samples at M hydrophones is z ~ t(ν, 0, (ν−2)/ν (η H(ψ)Hᵀ(ψ) + I)) with
-a source and the same with η = 0 without. Since HᵀH = M I, the determinant is (1 + Mη)^N and the inverse I −
-η/(1 + Mη) H Hᵀ, so that
+The model of a whitened batch z of N samples at M hydrophones is z ~ t(ν, 0, (ν−2)/ν (η H(ψ)Hᵀ(ψ) + I))
+with a source, and the same with η = 0 without. Since HᵀH = M I, the determinant is (1 + Mη)^N and the inverse
+I − η/(1 + Mη) H Hᵀ, so that
 
     ln L = −(N/2) ln(1 + Mη) − ((ν + NM)/2) ln(1 − c B(ψ, z)),   c = η / ((1 + Mη)(ν − 2 + ‖z‖²))
     ln L = −(N/2) ln(1 + Mη) + ½ η B(ψ, z) / (1 + Mη)            as ν → ∞, the Gaussian one.
 
-Source: Bossér et al., Broadband passive sonar track-before-detect using raw acoustic data, eqs 17–28 (28
-with the ν − 2 of its scale matrix).
+Source: Bossér et al., Broadband passive sonar track-before-detect using raw acoustic data, eqs 17–28
+(28 with the ν − 2 of its scale matrix).
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class BeamLikelihood:
     ) -> None:
         if not (degrees_of_freedom > 2 and step_deg > 0):
             raise ConfigError(
-                f"degrees of freedom must exceed 2 and beams step upwards, found {degrees_of_freedom}, {step_deg}"
+                "degrees of freedom must exceed 2 and the beams step upwards, "
+                f"found {degrees_of_freedom} and {step_deg} deg"
             )
         self._grid = (float(first_deg), float(step_deg))
         self._size = (int(nperseg), int(hydrophones))
@@ -96,8 +97,14 @@ class BeamLikelihood:
     def __call__(
         self, power: np.ndarray, energy: float, azimuth_deg: np.ndarray, snr_db: np.ndarray
     ) -> np.ndarray:
-        """Log-likelihood ratios, dims (hypothesis,), of a batch with `power` (beam,) and `energy`, at
-        paired azimuths and SNRs."""
+        """Log-likelihood ratios of one batch, dims (hypothesis,).
+
+        Parameters
+        ----------
+        power : array, dims (beam,)
+        energy : float
+        azimuth_deg, snr_db : arrays, dims (hypothesis,)
+        """
         return _interpolated(power, energy, azimuth_deg, snr_db, *self._grid, *self._size, self._nu)
 
 

@@ -1,5 +1,4 @@
-"""Directional, coloured sea noise on an array: cross-spectral density, and the vector autoregression that
-has it."""
+"""Directional, coloured sea noise on an array: its cross-spectral density and its vector autoregression."""
 
 from __future__ import annotations
 
@@ -39,8 +38,16 @@ class NoiseSector:
 
 @dataclass(frozen=True)
 class SeaNoise:
-    """Powers at one hydrophone, mean over the band: self noise (white), diffuse sea (isotropic), and
-    sectors."""
+    """Sea noise as a sum, each part by its power at one hydrophone, mean over the band.
+
+    Parameters
+    ----------
+    self_noise : float
+        White, independent between hydrophones.
+    diffuse, diffuse_slope_db_octave : float
+        Isotropic in three dimensions: coherence sin(kd)/(kd).
+    sectors : tuple of NoiseSector
+    """
 
     self_noise: float
     diffuse: float
@@ -78,8 +85,7 @@ class SeaNoise:
     def noise_model(
         self, array: HydrophoneArray, sampling_rate: float, carrier_hz: float, order: int, bins: int = 2048
     ) -> NoiseModel:
-        """VAR(`order`) whose first `order` + 1 autocovariances are those of this noise, demodulated by
-        `carrier_hz`."""
+        """VAR(`order`) with the first `order` + 1 autocovariances of this noise after demodulation."""
         cycles = (np.arange(bins) + 0.5) / (2.0 * bins)
         density = self.spectral_density(array, carrier_hz + cycles * sampling_rate) / bins
         turns = np.exp(2j * np.pi * np.arange(order + 1)[:, None] * cycles)

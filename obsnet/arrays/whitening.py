@@ -1,5 +1,4 @@
-"""Ambient noise as a vector autoregression: fit, order, stability, simulation, and the filter that makes it
-white.
+"""Ambient noise as a vector autoregression: fit, order, stability, simulation, and the filter to white.
 
 e_n = A_1 e_{n−1} + … + A_o e_{n−o} + Σ^½ w_n, w white with unit covariance.
 Source: Bossér et al., Broadband passive sonar track-before-detect using raw acoustic data, eqs 29–32.
@@ -42,7 +41,7 @@ class NoiseModel:
         channels = len(covariance)
         if covariance.shape != (channels, channels) or coefficients.shape[1:] != covariance.shape:
             raise ConfigError(
-                "a noise model needs coefficients (lag, channel, channel) and a covariance (channel, channel), "
+                "a noise model needs coefficients (lag, channel, channel), covariance (channel, channel); "
                 f"found {coefficients.shape} and {covariance.shape}"
             )
         if not (np.isfinite(covariance).all() and np.isfinite(coefficients).all()):
@@ -81,21 +80,18 @@ class NoiseModel:
         return _symmetric_power(self.covariance, 0.5)
 
     def inverse_square_root(self) -> np.ndarray:
-        """Symmetric Σ^−½: of all whitening matrices the one that changes the samples, hence the steering,
-        least."""
+        """Symmetric Σ^−½, of all whitening matrices the one that changes the steering least."""
         return _symmetric_power(self.covariance, -0.5)
 
     def transfer(self, cycles_per_sample: np.ndarray) -> np.ndarray:
-        """Frequency response Σ^−½ (I − Σ_k A_k e^{−2πi f k}) of the whitening, dims (frequency, channel,
-        channel)."""
+        """Response Σ^−½ (I − Σ_k A_k e^{−2πi f k}) of the whitening, dims (frequency, channel, channel)."""
         lags = np.arange(1, self.order + 1)
         turns = np.exp(-2j * np.pi * np.asarray(cycles_per_sample, float)[:, None] * lags)
         response = np.eye(self.channels) - np.einsum("fk,kij->fij", turns, self.coefficients)
         return self.inverse_square_root() @ response
 
     def spectral_density(self, cycles_per_sample: np.ndarray) -> np.ndarray:
-        """Cross-spectral density, dims (frequency, channel, channel), of power per cycle per sample,
-        two-sided."""
+        """Two-sided cross-spectral density per cycle per sample, dims (frequency, channel, channel)."""
         inverse = np.linalg.inv(self.transfer(cycles_per_sample))
         return inverse @ np.conj(np.swapaxes(inverse, -1, -2))
 
@@ -131,8 +127,9 @@ class Whitener:
     What it does to a target. A plane wave with phases h(ψ, f) over the hydrophones leaves the filter as
     g(ψ, f) = Σ^−½ (I − Σ_k A_k e^{−2πifk}) h(ψ, f), so that g g* / ‖g‖² is no longer h h* / M and a white
     target becomes coloured with ‖g(ψ, f)‖². The paper's likelihood (its eq. 23) keeps h and a white
-    spectrum, and calls SNR the power η that then fits best. It costs |h* g|² / (M ‖g‖²) in beam power,
-    which is 1 for spatially white noise and small where the target stands in the direction of the noise.
+    spectrum, and calls SNR the power η that then fits best. That costs a factor |h* g|² / (M ‖g‖²) in beam
+    power, a few tenths of a decibel in a directional sea, and pulls the beam's peak a degree or so away
+    from the noise. `Beamformer(whitening=…)` matches the beams to g instead.
     """
 
     def __init__(self, model: NoiseModel) -> None:
@@ -240,8 +237,7 @@ def check_samples(samples: np.ndarray, channels: int | None = None) -> None:
 
 
 def _triangle(samples: np.ndarray, order: int) -> tuple[np.ndarray, int]:
-    """R of the QR decomposition of [e_{n−1}, …, e_{n−o}, e_n]: least squares of every order up to o are
-    inside it."""
+    """R of the QR of [e_{n−1}, …, e_{n−o}, e_n]; it holds the least squares of every order up to o."""
     samples = np.asarray(samples, float)
     check_samples(samples)
     if order < 0:
@@ -250,7 +246,8 @@ def _triangle(samples: np.ndarray, order: int) -> tuple[np.ndarray, int]:
     used = count - order
     if used <= (order + 1) * channels:
         raise WaveformError(
-            f"a VAR({order}) of {channels} channels needs over {(order + 1) * channels + order} samples, found {count}"
+            f"a VAR({order}) of {channels} channels needs over {(order + 1) * channels + order} samples, "
+            f"found {count}"
         )
     columns = [samples[order - lag : count - lag] for lag in [*range(1, order + 1), 0]]
     return np.asarray(np.linalg.qr(np.concatenate(columns, axis=1), mode="r")), used

@@ -18,16 +18,15 @@ from obsnet.errors import ConfigError
 
 
 def archipelago() -> SeaNoise:
-    """Wind noise from everywhere, traffic from two sectors, the machinery of two distant ships; total power
-    1."""
+    """Wind noise from everywhere, traffic from two sectors, the machinery of two ships; total power 1."""
     return SeaNoise(
-        self_noise=0.03,
-        diffuse=0.37,
+        self_noise=0.01,
+        diffuse=0.19,
         sectors=(
-            NoiseSector(-40.0, 10.0, 0.28, slope_db_octave=-9.0),
-            NoiseSector(40.0, 10.0, 0.28, slope_db_octave=-9.0),
-            NoiseSector(-20.0, 2.0, 0.02, line_hz=880.0, line_width_hz=3.0),
-            NoiseSector(25.0, 2.0, 0.02, line_hz=800.0, line_width_hz=3.0),
+            NoiseSector(-20.0, 8.0, 0.35, slope_db_octave=-9.0),
+            NoiseSector(35.0, 10.0, 0.35, slope_db_octave=-9.0),
+            NoiseSector(-5.0, 2.0, 0.05, slope_db_octave=0.0, line_hz=880.0, line_width_hz=3.0),
+            NoiseSector(20.0, 2.0, 0.05, slope_db_octave=0.0, line_hz=800.0, line_width_hz=3.0),
         ),
     )
 

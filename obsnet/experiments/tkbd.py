@@ -27,7 +27,7 @@ from obsnet.experiments.approach import Approach
 from obsnet.experiments.montecarlo import Progress
 from obsnet.experiments.tkbd_result import Outcome, Result, outcome, track_batches
 from obsnet.trackers.azimuth_grid import AzimuthGrid
-from obsnet.trackers.bernoulli import BernoulliConfig
+from obsnet.trackers.bernoulli_filter import BernoulliConfig
 from obsnet.trackers.cfar import CfarConfig, detection_llr, exceedance, merge
 from obsnet.trackers.track_before_detect import (
     BearingTrack,

@@ -190,7 +190,7 @@ class Result:
                 (
                     name,
                     _number(self.confirmation_db(name), "dB"),
-                    _number(PAPER_SNR_DB.get(name), "dB"),
+                    _number(PAPER_SNR_DB[name], "dB") if name in PAPER_SNR_DB else "",
                     f"{self.held(name):.0%}",
                     f"{self.false_tracks(name):.0%} of runs",
                     _number(self.mean_ospa_deg(name), "deg"),
@@ -217,8 +217,7 @@ class Result:
         return {name: statistic(name) for name in self.trackers}
 
     def plot(self, path: str | Path) -> None:
-        """Figure like the paper's fig. 5: beam power with the true azimuth, OSPA, SNR and existence against
-        time."""
+        """Draw the paper's figure 5: beam power, OSPA, SNR and existence against time."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 

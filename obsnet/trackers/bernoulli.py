@@ -1,162 +1,233 @@
-"""Bernoulli filter by particles: the probability that a target exists, and its state if it does, batch by
-batch.
+"""Azimuth maps of a station, row by row, in; existence and azimuth of one ship out, live.
 
-With q the probability of existence and s the density of the state, the time update is (eqs 3a, 3b)
-
-    q' = p_b (1 − q) + p_s q,     s' = [p_b (1 − q) b + p_s q ∫ π s] / q'
-
-and the measurement update, L the likelihood ratio of target against no target (eqs 4a, 4b),
-
-    q = q' I / (1 − q' + q' I),   s ∝ L s',   I = ∫ L s'.
-
-The births b are the caller's, as a rule drawn or weighted by the previous measurement's likelihood. Source:
-Bossér et al., Broadband passive sonar track-before-detect using raw acoustic data; Ristic et al. 2013, IEEE
-Trans. Signal Process. 61(13), for the particles.
+What the grid search can only do once a passage is over. One ship at a time: of two, the filter follows the
+one that the map tells it more of. Bernoulli filter of Bossér et al. (see `bernoulli_filter`) with a
+circular state.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from obsnet.errors import ConfigError
-from obsnet.trackers.particles import normalise, systematic_resampling
+from obsnet.errors import ConfigError, LayoutError
+from obsnet.trackers.azimuth_grid import AzimuthGrid
+from obsnet.trackers.bernoulli_filter import BernoulliConfig, BernoulliFilter, move
+from obsnet.trackers.particles import circular_mean
 
 
 @dataclass(frozen=True)
-class BernoulliConfig:
-    """Numbers of the filter, per batch.
+class AzimuthTrackerConfig:
+    """A ship heard by one station, azimuth alone; numbers per minute or per second as named.
 
     Parameters
     ----------
-    survival, birth : float
-        p_s and p_b, probabilities that a target goes on existing and that one appears.
-    confirmation : float
-        A target is confirmed while q exceeds this.
-    particles, births : int
-        Particles kept after a batch, and new ones that the caller adds before the next.
+    interval_s : float
+        Time between the rows of the map.
+    acceleration_deg_s2 : float
+        Standard deviation of the azimuth's acceleration, constant within an interval.
+    rate_std_deg_s : float
+        Spread of a newborn ship's azimuth rate; 0.03 deg/s is 7 m/s across at 13 km.
+    detection_probability : float
+        P_d: in the other minutes the map says nothing of the ship. L becomes 1 − P_d + P_d L, so that one
+        minute cannot end a track.
+    weight : float
+        Exponent of the map's ratios: windows of three minutes every minute count everything three times.
+    bernoulli : BernoulliConfig
+        By default a ship stays for 100 min, and one comes every 5 h.
     """
 
-    survival: float = 0.9999
-    birth: float = 1e-5
-    confirmation: float = 0.9
-    particles: int = 1000
-    births: int = 250
+    interval_s: float = 60.0
+    acceleration_deg_s2: float = 5e-5
+    rate_std_deg_s: float = 0.03
+    detection_probability: float = 0.9
+    weight: float = 1.0 / 3.0
+    bernoulli: BernoulliConfig = field(
+        default_factory=lambda: BernoulliConfig(survival=0.99, birth=1 / 300, particles=2000, births=500)
+    )
 
     def __post_init__(self) -> None:
-        for name in ("survival", "birth", "confirmation"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ConfigError(f"{name} must lie between 0 and 1, found {getattr(self, name)!r}")
-        if self.particles < 1 or self.births < 1:
+        if not (self.interval_s > 0 and self.acceleration_deg_s2 >= 0 and self.rate_std_deg_s >= 0):
+            raise ConfigError("an azimuth tracker needs a positive interval and process noises of 0 or more")
+        if not (0 < self.detection_probability <= 1 and self.weight > 0):
             raise ConfigError(
-                f"particles and births must be at least 1, found {self.particles} and {self.births}"
+                "detection_probability must lie in (0, 1] and weight be positive, "
+                f"found {self.detection_probability!r} and {self.weight!r}"
             )
 
 
-class BernoulliFilter:
-    """The recursion, whatever the state and the measurement.
+def tempered(llr: np.ndarray, weight: float, detection_probability: float) -> np.ndarray:
+    """ln(1 − P_d + P_d e^(weight · llr)); NaN cells, of which nothing is known, become 0."""
+    with np.errstate(divide="ignore"):
+        mixed = np.logaddexp(np.log1p(-detection_probability), np.log(detection_probability) + weight * llr)
+    return np.where(np.isnan(llr), 0.0, mixed)
 
-    Attributes
+
+class AzimuthTracker:
+    """Live Bernoulli filter on azimuth maps: state azimuth [deg] and its rate [deg/s], row by row.
+
+    The random numbers of a row come from (seed, number of the row): a tracker restored from `state_dict`
+    goes on as if it had never stopped.
+
+    Parameters
     ----------
-    existence : float
-        q after the last batch.
-    states : array, dims (state, particle)
-        Equally weighted particles of the state, if a target exists.
+    azimuth_deg : array, dims (azimuth,)
+        Equal steps, a whole circle or a sector.
+    config : AzimuthTrackerConfig, optional
+    seed : int
     """
 
-    def __init__(self, config: BernoulliConfig, states: np.ndarray, existence: float = 0.0) -> None:
-        states = np.array(states, float)
-        if states.ndim != 2 or states.shape[1] < 1 or not np.isfinite(states).all():
-            raise ConfigError(
-                f"a filter starts from finite states, dims (state, particle), found {states.shape}"
-            )
-        if not 0.0 <= existence < 1.0:
-            raise ConfigError(f"the first existence probability must lie in [0, 1), found {existence!r}")
-        self.config = config
-        self.states = states
-        self.existence = float(existence)
+    def __init__(
+        self, azimuth_deg: np.ndarray, config: AzimuthTrackerConfig | None = None, seed: int = 0
+    ) -> None:
+        self.config = config or AzimuthTrackerConfig()
+        self._grid = AzimuthGrid(azimuth_deg)
+        self._seed, self._row = int(seed), 0
+        self._previous: np.ndarray | None = None
+        self._filter = BernoulliFilter(
+            self.config.bernoulli, self._births(np.random.default_rng([self._seed]))
+        )
+
+    @property
+    def existence(self) -> float:
+        """Probability that a ship is there, after the last row."""
+        return self._filter.existence
 
     @property
     def confirmed(self) -> bool:
-        """Whether a target is confirmed."""
-        return self.existence > self.config.confirmation
+        """Whether that probability exceeds the threshold."""
+        return self._filter.confirmed
 
-    def step(
-        self,
-        propagate: Callable[[np.ndarray], np.ndarray],
-        births: np.ndarray,
-        log_likelihood: Callable[[np.ndarray], np.ndarray] | None,
-        rng: np.random.Generator,
-        birth_log_weights: np.ndarray | None = None,
-    ) -> float:
-        """Time update, then measurement update, then resampling; the existence probability after it.
+    @property
+    def azimuth(self) -> tuple[float, float]:
+        """Mean azimuth [0, 360) and its circular standard deviation, deg, if a ship is there."""
+        return circular_mean(self._filter.states[0], np.zeros(self._filter.states.shape[1]))
 
-        Parameters
-        ----------
-        propagate : callable
-            Draws the states one batch later, dims (state, particle) in and out.
-        births : array, dims (state, birth)
-            Draws from the birth density b.
-        log_likelihood : callable or None
-            ln L of states, minus infinity where a target is impossible; None where there is no measurement.
-        rng : Generator
-        birth_log_weights : array, dims (birth,), optional
-            Where the births are not equally weighted; need not be normalised.
+    def step(self, llr_row: np.ndarray) -> float:
+        """Existence probability after one more row, dims (azimuth,), natural logs; all NaN is a gap.
 
         Raises
         ------
+        LayoutError
+            The row is not as long as the grid, or holds plus infinity.
         FilterError
-            ln L is NaN or plus infinity for a particle, or minus infinity for all of them.
+            Every particle is impossible.
         """
-        config, q = self.config, self.existence
-        appeared, survived = config.birth * (1.0 - q), config.survival * q
-        predicted = appeared + survived
-        old = self.states.shape[1]
-        states = np.concatenate([propagate(self.states), births], axis=1)
-        weights = np.empty(states.shape[1])
-        weights[:old] = _log(survived / predicted / old)
-        weights[old:] = _log(appeared / predicted)
-        if birth_log_weights is None:
-            weights[old:] -= np.log(births.shape[1])
-        else:
-            weights[old:] += normalise(birth_log_weights, "birth")[0]
-        if log_likelihood is not None:
-            weights += log_likelihood(states)
-            weights, evidence = normalise(weights)
-            odds = math.log(predicted) - math.log1p(-predicted) + evidence
-            predicted = 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
-        self.existence = predicted
-        self.states = states[:, systematic_resampling(weights, rng, config.particles)]
+        row = np.asarray(llr_row, float)
+        if row.shape != self._grid.azimuth_deg.shape or np.isposinf(row).any():
+            raise LayoutError(
+                f"a row must hold {len(self._grid.azimuth_deg)} log-likelihood ratios below infinity, "
+                f"found shape {row.shape}"
+            )
+        config = self.config
+        measured = None if np.isnan(row).all() else tempered(row, config.weight, config.detection_probability)
+        self._row += 1
+        rng = np.random.default_rng([self._seed, self._row])
+        births = self._births(rng)
+        weights = None if self._previous is None else self._grid(self._previous, births[0])
+        likelihood = None if measured is None else lambda states: self._grid(measured, states[0])
+        self._filter.step(lambda states: self._moved(states, rng), births, likelihood, rng, weights)
+        self._previous = measured
         return self.existence
 
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """All that a restart needs, as plain arrays."""
+        previous = np.empty(0) if self._previous is None else self._previous
+        return {
+            "azimuth_deg": self._grid.azimuth_deg.copy(),
+            "states": self._filter.states.copy(),
+            "existence": np.array(self.existence),
+            "previous": previous.copy(),
+            "position": np.array([self._seed, self._row]),
+        }
 
-def move(states: np.ndarray, interval_s: float, acceleration: float, rng: np.random.Generator) -> np.ndarray:
-    """Nearly constant velocity: rows 0 and 1 are a coordinate and its rate, driven by white acceleration
-    (eq. 34).
+    @classmethod
+    def from_state_dict(
+        cls, state: Mapping[str, np.ndarray], config: AzimuthTrackerConfig | None = None
+    ) -> AzimuthTracker:
+        """Tracker that goes on where `state_dict` was taken, given the same configuration."""
+        missing = {"azimuth_deg", "states", "existence", "previous", "position"} - set(state)
+        if missing:
+            raise LayoutError(f"the state of an azimuth tracker lacks {', '.join(sorted(missing))}")
+        seed, row = (int(value) for value in state["position"])
+        tracker = cls(state["azimuth_deg"], config, seed)
+        tracker._filter = BernoulliFilter(
+            tracker.config.bernoulli, state["states"], float(state["existence"])
+        )
+        tracker._row = row
+        tracker._previous = np.asarray(state["previous"], float) if len(state["previous"]) else None
+        return tracker
+
+    def _births(self, rng: np.random.Generator) -> np.ndarray:
+        count = self.config.bernoulli.births
+        span = self._grid.step_deg * (len(self._grid.azimuth_deg) - (not self._grid.circular))
+        azimuth = self._grid.first_deg + span * (np.arange(count) + rng.random(count)) / count
+        return np.stack([azimuth, self.config.rate_std_deg_s * rng.standard_normal(count)])
+
+    def _moved(self, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        moved = move(states, self.config.interval_s, self.config.acceleration_deg_s2, rng)
+        if self._grid.circular:
+            moved[0] %= 360.0
+        return moved
+
+
+@dataclass(frozen=True)
+class AzimuthTrack:
+    """Probability that a ship is there; its azimuth and standard deviation if it is, deg; dims (time,)."""
+
+    existence: np.ndarray
+    azimuth_deg: np.ndarray
+    azimuth_std_deg: np.ndarray
+
+
+def track_azimuth(
+    times_s: np.ndarray,
+    azimuth_llr: np.ndarray,
+    azimuth_deg: np.ndarray,
+    config: AzimuthTrackerConfig | None = None,
+    seed: int = 0,
+) -> AzimuthTrack:
+    """Bernoulli filter over a station's azimuth map, minute by minute, using no minute before it is heard.
 
     Parameters
     ----------
-    states : array, dims (state, particle)
-        Further rows are left as they are.
-    interval_s : float
-        T.
-    acceleration : float
-        Standard deviation, coordinate per s², constant within the interval.
-    rng : Generator
+    times_s : array, dims (time,), s since 1970
+        Increasing by whole intervals; missing rows count as gaps.
+    azimuth_llr : array, dims (time, azimuth), natural logs; NaN where there are no data
+    azimuth_deg : array, dims (azimuth,)
+    config : AzimuthTrackerConfig, optional
+    seed : int
 
-    Returns
-    -------
-    array, dims (state, particle)
+    Raises
+    ------
+    LayoutError
+        Shapes do not agree, or times do not increase by whole intervals.
+    FilterError
+        As `AzimuthTracker.step`.
     """
-    kick = acceleration * interval_s * rng.standard_normal(states.shape[1])
-    moved = states.copy()
-    moved[0] += interval_s * (states[1] + 0.5 * kick)
-    moved[1] += kick
-    return moved
+    tracker = AzimuthTracker(azimuth_deg, config, seed)
+    steps = intervals(times_s, len(azimuth_llr), tracker.config.interval_s)
+    gap = np.full(len(tracker.state_dict()["azimuth_deg"]), np.nan)
+    output = np.empty((3, len(steps)))
+    for row, (llr, step) in enumerate(zip(azimuth_llr, steps, strict=True)):
+        for _ in range(step - 1):
+            tracker.step(gap)
+        output[0, row] = tracker.step(llr)
+        output[1:, row] = tracker.azimuth
+    return AzimuthTrack(*output)
 
 
-def _log(value: float) -> float:
-    return math.log(value) if value > 0.0 else -math.inf
+def intervals(times_s: np.ndarray, rows: int, interval_s: float) -> np.ndarray:
+    """Intervals from each row to the one before, at most a day; 1 for the first row."""
+    times = np.asarray(times_s, float)
+    if times.shape != (rows,):
+        raise LayoutError(f"{rows} rows of a map need as many times, found {times.shape}")
+    steps = np.diff(times) / interval_s
+    whole = np.round(steps)
+    if (whole < 1).any() or (np.abs(steps - whole) > 0.01).any():
+        raise LayoutError(
+            f"times of a map must increase by whole intervals of {interval_s:g} s; resample the map"
+        )
+    return np.concatenate([[1], np.minimum(whole, np.ceil(86400.0 / interval_s))]).astype(int)[:rows]

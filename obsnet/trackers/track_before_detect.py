@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from obsnet.errors import ConfigError
-from obsnet.trackers.bernoulli import BernoulliConfig, BernoulliFilter, move
+from obsnet.trackers.bernoulli_filter import BernoulliConfig, BernoulliFilter, move
 
 Likelihood = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -62,8 +62,7 @@ class BearingTrackerConfig:
 
 @dataclass(frozen=True)
 class BearingTrack:
-    """Filter output, dims (batch,): existence probability, posterior means and azimuth spread given
-    existence."""
+    """Existence probability; posterior means and azimuth spread given existence; dims (batch,)."""
 
     existence: np.ndarray
     azimuth_deg: np.ndarray
