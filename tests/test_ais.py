@@ -76,7 +76,7 @@ class TestDialects:
         text = (
             "MMSI,BaseDateTime,LAT,LON,SOG,COG,Heading,VesselName,IMO,CallSign,VesselType,Status,"
             "Length,Width,Draft,Cargo,TransceiverClass\n"
-            '209187000,2013-05-21T10:00:00,-21.40000,54.1,13.4,247.3,511.0,"LADY, SEA",,X,70,0,288,45,11,70,A\n'
+            '209187000,2013-05-21T10:00:00,-21.40000,54.1,13.4,247.3,511.0,"LADY, SEA",,,70,0,288,45,,,A\n'
             "209187000,2013-05-21T10:10:00,-21.42000,54.06000,102.3,360.0,245.0,LADY,,X,70,0,,,,,A\n"
         )
         table = ais.read(write(tmp_path / "AIS_2013.csv", text))

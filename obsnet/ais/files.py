@@ -31,6 +31,8 @@ from obsnet.ais.quality import distance_m, drop_jumps
 from obsnet.errors import AISError, OutputError
 
 CHUNK_ROWS = 500_000
+Block = tuple[str, int, pd.DataFrame]
+Disc = tuple[float, float, float]
 COLUMNS = ["mmsi", "time", "lon", "lat", "sog_mps", "cog_deg", "heading_deg"]
 STATIC = ["ship_type", "length_m", "width_m", "to_stern_m", "name"]
 
@@ -92,17 +94,12 @@ def read(
     dialects: list[str] = []
     tables: list[pd.DataFrame] = []
     rows = 0
+    disc = None if near is None else (*near, within_m)
     for item in paths:
-        for dialect, raw_rows, table in _tables(item, dropped):
+        for dialect, raw_rows, table in _tables(item, disc, dropped):
             if dialect not in dialects:
                 dialects.append(dialect)
             rows += raw_rows
-            if near is not None:
-                inside = (
-                    distance_m(near[0], near[1], table["lat"].to_numpy(), table["lon"].to_numpy()) <= within_m
-                )
-                dropped["too far away"] += int((~inside).sum())
-                table = table[inside]
             tables.append(table)
     ais = _assemble(tables, dropped)
     report = ReadReport(tuple(dialects), rows, len(ais), {reason: n for reason, n in dropped.items() if n})
@@ -150,7 +147,7 @@ def _assemble(tables: list[pd.DataFrame], dropped: Counter[str]) -> pd.DataFrame
     return ais[COLUMNS + static]
 
 
-def _tables(path: Path, dropped: Counter[str]) -> list[tuple[str, int, pd.DataFrame]]:
+def _tables(path: Path, disc: Disc | None, dropped: Counter[str]) -> list[Block]:
     """Dialect, raw rows and cleaned table of each block of a file; drops are counted into `dropped`.
 
     A quotation mark that is never closed would swallow the rest of a table: such a file is read again without
@@ -160,7 +157,7 @@ def _tables(path: Path, dropped: Counter[str]) -> list[tuple[str, int, pd.DataFr
         for quoting in (csv.QUOTE_MINIMAL, csv.QUOTE_NONE):
             counts: Counter[str] = Counter()
             try:
-                tables = list(_blocks(path, quoting, counts))
+                tables = [_within(block, disc, counts) for block in _blocks(path, quoting, counts)]
             except pd.errors.ParserError as error:
                 reason = " ".join(str(error).split())
                 continue
@@ -173,7 +170,19 @@ def _tables(path: Path, dropped: Counter[str]) -> list[tuple[str, int, pd.DataFr
     raise AISError(f"{path} cannot be read as a table: {reason}")
 
 
-def _blocks(path: Path, quoting: int, dropped: Counter[str]) -> Iterator[tuple[str, int, pd.DataFrame]]:
+def _within(block: Block, disc: Disc | None, dropped: Counter[str]) -> Block:
+    """The block's positions inside a disc (latitude, longitude, radius in m); the others are counted."""
+    dialect, rows, table = block
+    if disc is None:
+        return block
+    inside = (
+        distance_m(disc[0], disc[1], table["lat"].to_numpy(float), table["lon"].to_numpy(float)) <= disc[2]
+    )
+    dropped["too far away"] += int((~inside).sum())
+    return dialect, rows, table[inside]
+
+
+def _blocks(path: Path, quoting: int, dropped: Counter[str]) -> Iterator[Block]:
     for name, stream in _streams(path):
         if re.search(rb"![A-Z]{2}VD[MO],", _peek(stream)):
             raw, counts = nmea.decode(stream, name)
@@ -183,9 +192,7 @@ def _blocks(path: Path, quoting: int, dropped: Counter[str]) -> Iterator[tuple[s
             yield from _csv_blocks(stream, name, quoting, dropped)
 
 
-def _csv_blocks(
-    stream: IO[bytes], name: str, quoting: int, dropped: Counter[str]
-) -> Iterator[tuple[str, int, pd.DataFrame]]:
+def _csv_blocks(stream: IO[bytes], name: str, quoting: int, dropped: Counter[str]) -> Iterator[Block]:
     encoding = "utf-16" if _peek(stream)[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     text = io.TextIOWrapper(stream, encoding=encoding, errors="replace", newline="")
     header, separator = _header(text, name)
@@ -217,7 +224,7 @@ def _csv_blocks(
 
 def _header(text: IO[str], name: str) -> tuple[list[str], str]:
     """The first line that names columns (comments before it are skipped), and its separator."""
-    for line in text:
+    while line := text.readline(1 << 16):
         stripped = line.strip()
         if not stripped or (stripped.startswith("#") and "timestamp" not in stripped.lower()):
             continue
