@@ -7,15 +7,10 @@ counted by its reason.
 
 from __future__ import annotations
 
-import bz2
 import csv
-import gzip
 import io
-import lzma
 import os
 import re
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +21,7 @@ import numpy as np
 import pandas as pd
 
 from obsnet.ais import nmea
+from obsnet.ais.compression import explained, streams
 from obsnet.ais.dialects import KNOT, NMEA, clean, keys_of, recognise
 from obsnet.ais.quality import distance_m, drop_jumps
 from obsnet.errors import AISError, OutputError
@@ -153,20 +149,16 @@ def _tables(path: Path, disc: Disc | None, dropped: Counter[str]) -> list[Block]
     A quotation mark that is never closed would swallow the rest of a table: such a file is read again without
     quoting.
     """
-    try:
-        for quoting in (csv.QUOTE_MINIMAL, csv.QUOTE_NONE):
-            counts: Counter[str] = Counter()
-            try:
+    for quoting in (csv.QUOTE_MINIMAL, csv.QUOTE_NONE):
+        counts: Counter[str] = Counter()
+        try:
+            with explained(path):
                 tables = [_within(block, disc, counts) for block in _blocks(path, quoting, counts)]
-            except pd.errors.ParserError as error:
-                reason = " ".join(str(error).split())
-                continue
-            dropped.update(counts)
-            return tables
-    except (EOFError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
-        raise AISError(f"{path} is damaged: {error}; get the file again") from None
-    except OSError as error:
-        raise AISError(f"cannot read the AIS file {path}: {error.strerror or error}") from None
+        except pd.errors.ParserError as error:
+            reason = " ".join(str(error).split())
+            continue
+        dropped.update(counts)
+        return tables
     raise AISError(f"{path} cannot be read as a table: {reason}")
 
 
@@ -183,7 +175,7 @@ def _within(block: Block, disc: Disc | None, dropped: Counter[str]) -> Block:
 
 
 def _blocks(path: Path, quoting: int, dropped: Counter[str]) -> Iterator[Block]:
-    for name, stream in _streams(path):
+    for name, stream in streams(path):
         if re.search(rb"![A-Z]{2}VD[MO],", _peek(stream)):
             raw, counts = nmea.decode(stream, name)
             dropped.update(counts)
@@ -233,41 +225,5 @@ def _header(text: IO[str], name: str) -> tuple[list[str], str]:
     raise AISError(f"the AIS file {name} is empty")
 
 
-def _buffered(raw: Any) -> IO[bytes]:
-    return io.BufferedReader(raw, 1 << 16)
-
-
 def _peek(stream: IO[bytes]) -> bytes:
     return stream.peek(1 << 15)  # type: ignore[attr-defined, no-any-return]
-
-
-def _streams(path: Path) -> Iterator[tuple[str, IO[bytes]]]:
-    """Every table of a file, decompressed: one, or all members of a zip archive."""
-    with open(path, "rb") as file:
-        magic = file.peek(4)[:4]
-        if magic.startswith(b"PK\x03\x04"):
-            with zipfile.ZipFile(file) as archive:
-                for member in archive.infolist():
-                    if not member.is_dir() and "__MACOSX" not in member.filename:
-                        with archive.open(member) as inner:
-                            yield f"{path}:{member.filename}", _buffered(inner)
-            return
-        yield str(path), _buffered(_decompressed(file, magic, path))
-
-
-def _decompressed(file: IO[bytes], magic: bytes, path: Path) -> Any:
-    if magic.startswith(b"\x1f\x8b"):
-        return gzip.GzipFile(fileobj=file)
-    if magic.startswith(b"BZh"):
-        return bz2.BZ2File(file)
-    if magic == b"\xfd7zX":
-        return lzma.LZMAFile(file)
-    if magic == b"\x28\xb5\x2f\xfd":
-        try:
-            import zstandard
-        except ImportError:
-            raise AISError(
-                f"{path} is compressed with zstandard; to read it: pip install obsnet[ais]"
-            ) from None
-        return zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
-    return file
