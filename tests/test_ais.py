@@ -314,14 +314,14 @@ class TestFiles:
             ais.read(write(tmp_path / "ais.csv", content))
         assert "\n" not in str(caught.value)
 
-    def test_zstandard_frames_damage_and_truncation(self, tmp_path, plain):
+    def test_zstandard_frames_damage_and_truncation(self, tmp_path):
         pack = pytest.importorskip("zstandard").ZstdCompressor().compress
         rng = np.random.default_rng(0)
         head, *rows = [f"{i},2013-05-21T10:00:00Z,{54 + rng.random():.6f},-21" for i in range(20_000)]
         text = "\n".join(["mmsi,time,lon,lat", head, *rows]).encode()
         packed = pack(text[:200_000]) + pack(text[200_000:])
         assert len(ais.read(write(tmp_path / "two frames", packed))) == 20_000
-        for broken in (packed[:-1000], packed[:5000], packed[:300] + bytes(90) + packed[390:]):
+        for broken in (packed[:-1000], packed[:5000], packed + b"garbage after the end"):
             with pytest.raises(AISError, match="is damaged"):
                 ais.read(write(tmp_path / "broken", broken))
 

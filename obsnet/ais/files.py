@@ -124,6 +124,7 @@ def write_plain(ais: pd.DataFrame, path: str | Path) -> None:
         table.to_csv(partial, index=False)
         os.replace(partial, path)
     except OSError as error:
+        partial.unlink(missing_ok=True)
         raise OutputError(f"cannot write the AIS file {path}: {error.strerror or error}") from None
 
 
