@@ -26,8 +26,8 @@ from obsnet.signals.timeline import Piece
 
 _DAY_NS = 86_400_000_000_000
 _OTHER_SUFFIXES = frozenset(
-    (".xml", ".csv", ".json", ".geojson", ".nc", ".png", ".pdf", ".svg", ".html", ".md")
-    + (".yaml", ".yml", ".toml", ".onnx", ".zst", ".pickle", ".pkl")
+    {".xml", ".csv", ".json", ".geojson", ".nc", ".png", ".pdf", ".svg", ".html", ".md", ".yaml", ".yml"}
+    | {".toml", ".onnx", ".zst", ".pickle", ".pkl"}
 )
 _SDS_FILE = re.compile(r"^([^.]+)\.([^.]+)\.([^.]*)\.([^.]+)\.[A-Z]\.(\d{4})\.(\d{3})$")
 
@@ -90,30 +90,45 @@ def _day_overlaps(name: str, begin: int | None, end: int | None) -> bool:
 
 
 class FileReader:
-    """Reads whole files through obspy, keeping the last few."""
+    """Reads whole files through obspy, keeping the last few.
 
-    def __init__(self, files: int = 6) -> None:
+    Parameters
+    ----------
+    note : callable, optional
+        Is told of files whose headers can be read but whose samples cannot; they are NaN.
+    files : int
+        Files to keep.
+    """
+
+    def __init__(self, note: Callable[[str], None] | None = None, files: int = 6) -> None:
         self._kept: OrderedDict[Path, Any] = OrderedDict()
-        self._files = files
+        self._note, self._files = note, files
 
     def pieces(self, path: Path) -> Iterator[tuple[str, Piece]]:
         """SEED id and piece of every trace of a file, from its headers."""
-        number = -1
-        for trace in _read_with_obspy(path, headonly=True):
-            number += 1
+        for number, trace in enumerate(_read_with_obspy(path, headonly=True)):
             if trace.stats.npts > 0 and trace.stats.sampling_rate > 0:
                 yield trace.id, trace_piece(trace, partial(self._read, path, number))
 
     def _read(self, path: Path, number: int, first: int, last: int) -> np.ndarray:
+        traces = self._traces(path)
+        data = traces[number].data[first:last] if number < len(traces) else np.zeros(0)
+        if data.size != last - first or data.dtype.kind not in "iuf":
+            if self._note is not None:
+                self._note(f"{path.name}: the samples cannot be read; they are missing")
+            return np.full(last - first, np.nan, np.float32)
+        return np.ma.filled(data.astype(np.float64), np.nan) if np.ma.isMaskedArray(data) else data
+
+    def _traces(self, path: Path) -> Any:
         if path not in self._kept:
-            self._kept[path] = _read_with_obspy(path, headonly=False)
+            try:
+                self._kept[path] = _read_with_obspy(path, headonly=False)
+            except (WaveformError, OSError):
+                self._kept[path] = []
             while len(self._kept) > self._files:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(path)
-        data = self._kept[path][number].data[first:last]
-        if data.size != last - first or data.dtype.kind not in "iuf":
-            return np.full(last - first, np.nan, np.float32)
-        return np.ma.filled(data.astype(np.float64), np.nan) if np.ma.isMaskedArray(data) else data
+        return self._kept[path]
 
 
 def _read_with_obspy(path: Path, headonly: bool) -> Any:

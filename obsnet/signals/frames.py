@@ -68,8 +68,8 @@ class FrameTransform:
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Spectra (frame, bin) complex64 of frames (frame, sample) float64, which are overwritten.
 
-        Each frame's windowed mean is removed, which leaves nothing at 0 Hz; a plain mean would put a loud tone's
-        unfinished cycle into the lowest bins.
+        Each frame's windowed mean is removed, which leaves nothing at 0 Hz; a plain mean would put a loud
+        tone's unfinished cycle into the lowest bins.
         """
         frames -= (frames @ self._window / self._weight)[:, None]
         frames *= self._window

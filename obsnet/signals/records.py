@@ -8,6 +8,7 @@ deployment. Only the records asked for are read, so that a file of a month costs
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,10 @@ from typing import Literal
 import numpy as np
 import obspy
 
+from obsnet.errors import WaveformError
 from obsnet.signals.timeline import JOIN_SAMPLES, Piece
 
+_HEADER = re.compile(rb"[0-9 \x00]{6}[DRQM][ \x00]")
 _CHUNK_BYTES = 4 << 20
 _SECOND = 1_000_000_000
 _TABLE = np.dtype(
@@ -88,8 +91,8 @@ class RecordReader:
     def _read(self, path: Path, number: int, record: int, first: int, last: int) -> np.ndarray:
         """Samples `first` to `last`, counted from the start of `record`."""
         file = self._index(path)
-        if file is None:
-            return np.full(last - first, np.nan, np.float32)
+        if file is None or last <= first:
+            return np.full(max(last - first, 0), np.nan, np.float32)
         channel = file.channels[number]
         origin = channel.before[record]
         low = int(np.searchsorted(channel.before, origin + first, "right")) - 1
@@ -124,10 +127,19 @@ class RecordReader:
 
 
 def scan(path: Path) -> RecordFile | None:
-    """Index the records of a miniSEED file; None if it is anything else, or its records differ in length."""
+    """Index the records of a miniSEED file; None if it is anything else, or its records differ in length.
+
+    Raises
+    ------
+    WaveformError
+        It would be miniSEED, but its first header is damaged.
+    """
     with path.open("rb") as file:
-        layout = _layout(file.read(512))
+        head = file.read(512)
+        layout = _layout(head)
         if layout is None:
+            if _HEADER.match(head) and not all(32 <= byte < 127 for byte in head[8:20]):
+                raise WaveformError("miniSEED with a damaged header")
             return None
         length, order = layout
         file.seek(0)
@@ -210,8 +222,11 @@ def _layout(head: bytes) -> tuple[int, str] | None:
 
 
 def _looks_like_data(raw: np.ndarray) -> np.ndarray:
-    digits = ((raw[:, :6] >= 48) & (raw[:, :6] <= 57)) | (raw[:, :6] == 32) | (raw[:, :6] == 0)
-    return digits.all(axis=1) & np.isin(raw[:, 6], list(b"DRQM")) & np.isin(raw[:, 7], (32, 0))
+    number, codes = raw[:, :6], raw[:, 8:20]
+    digits = ((number >= 48) & (number <= 57)) | (number == 32) | (number == 0)
+    printable = (codes >= 32) & (codes < 127)
+    kind = np.isin(raw[:, 6], list(b"DRQM")) & np.isin(raw[:, 7], (32, 0))
+    return digits.all(axis=1) & printable.all(axis=1) & kind
 
 
 def _parse(raw: np.ndarray, order: str, base: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,15 +26,13 @@ import xarray as xr
 
 from obsnet.errors import ConfigError, StationError, WaveformError
 from obsnet.layout import iso
-from obsnet.signals.frames import FrameTransform, clipped, constant, touched
-from obsnet.signals.response import described, frequency_response
+from obsnet.signals.channels import ChannelSpectra, rotation
+from obsnet.signals.response import described
 from obsnet.signals.station import Channel, Station
-from obsnet.signals.timeline import Run
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 
 _SECOND = 1_000_000_000
-_BATCH = 64
-_DELAY_TOLERANCE_S = 1e-7
+_SILENCE_NS = 10 * 86400 * _SECOND
 
 
 @dataclass(frozen=True)
@@ -149,49 +148,60 @@ def iter_spectra(source: WaveformSource, config: SpectraConfig = SpectraConfig()
     Yields
     ------
     Dataset
-        As from `spectra`, of at most `block_s`; all blocks have the same variables.
+        As from `spectra`, of at most `block_s`; all blocks have the same variables. Frames in gaps are NaN,
+        but a silence of over ten days, such as a clock that starts in 1980 makes, is passed over and noted.
     """
-    first, last = _frame_range(source, config)
-    front = _FrontEnd(source, config, first, last)
+    spans = _spans(source, config)
+    builder = _Builder(source, config, spans[0][0], spans[-1][1])
     step = max(round(config.block_s / config.hop_s), 1)
-    for begin in range(first, last, step):
-        yield front.block(np.arange(begin, min(begin + step, last)))
+    for first, last in spans:
+        for begin in range(first, last, step):
+            yield builder.block(np.arange(begin, min(begin + step, last)))
 
 
-def _frame_range(source: WaveformSource, config: SpectraConfig) -> tuple[int, int]:
-    """Frames (in hops since 1970) whose centre is asked for and which lie in the data, to half a sample."""
+def _spans(source: WaveformSource, config: SpectraConfig) -> list[tuple[int, int]]:
+    """Ranges of frames (hops since 1970) centred in the span asked for, inside the data to half a sample."""
     hop, window = config.hop_ns, config.window_ns
     half = round(0.5 / config.analysis_rate_hz * _SECOND)
-    first = max(-(-(source.begin_ns - window // 2) // hop), -(-(source.data_begin_ns - half) // hop))
-    last = min(-(-(source.end_ns - window // 2) // hop), (source.data_end_ns + half - window) // hop + 1)
-    if first >= last:
-        span = (min(source.end_ns, source.data_end_ns) - max(source.begin_ns, source.data_begin_ns)) / _SECOND
+    asked = -(-(source.begin_ns - window // 2) // hop), -(-(source.end_ns - window // 2) // hop)
+    held, spans = source.covered(_SILENCE_NS), []
+    for begin, end in held:
+        first = max(asked[0], -(-(begin - half) // hop))
+        last = min(asked[1], (end + half - window) // hop + 1)
+        if first < last:
+            spans.append((first, last))
+    if not spans:
+        begin, end = max(source.begin_ns, source.data_begin_ns), min(source.end_ns, source.data_end_ns)
         raise WaveformError(
-            f"the waveforms of {source.station.code} hold no whole frame: {span:g} s from "
-            f"{iso(np.datetime64(max(source.begin_ns, source.data_begin_ns), 'ns'))}; give at least "
-            f"{config.window_s + config.hop_s:g} s"
+            f"the waveforms of {source.station.code} hold no whole frame: {(end - begin) / _SECOND:g} s from "
+            f"{iso(np.datetime64(begin, 'ns'))}; give at least {config.window_s + config.hop_s:g} s"
         )
-    return first, last
+    for (_, end), (begin, _) in pairwise(held):
+        days = (begin - end) / _SECOND / 86400
+        source.report.note(f"nothing for {days:.0f} days from {iso(np.datetime64(end, 'ns'))}: passed over")
+    return spans
 
 
-class _FrontEnd:
-    """Turns frame numbers into spectra; keeps what depends on the channel or its rate alone."""
+class _Builder:
+    """Makes the Dataset of a range of frames from the channels that serve at their times."""
 
     def __init__(self, source: WaveformSource, config: SpectraConfig, first: int, last: int) -> None:
         self.source, self.config, self.frequency = source, config, config.frequency
-        self._inverses: dict[Channel, np.ndarray] = {}
-        self._transforms: dict[float, FrameTransform] = {}
-        edges = {t for c in source.station.epochs for t in (c.starttime, c.endtime) if math.isfinite(t)}
-        self._edges = np.sort(np.array([round(t * _SECOND) for t in edges], np.int64))
+        self._channels = ChannelSpectra(
+            source, self.frequency, config.window_s, config.water_level_db, config.dead_s, config.clip_share
+        )
         centres = np.array([first, last - 1]) * config.hop_ns + config.window_ns // 2
-        inside = self._edges[(self._edges > centres[0]) & (self._edges <= centres[1])]
-        self._stations = {int(t): source.station_at(int(t)) for t in (centres[0], *inside)}
-        self._rotations = {t: _rotation(station, source) for t, station in self._stations.items()}
+        edges = {t for c in source.station.epochs for t in (c.starttime, c.endtime) if math.isfinite(t)}
+        turns = sorted(round(t * _SECOND) for t in edges)
+        regimes = [int(centres[0]), *(t for t in turns if centres[0] < t <= centres[1])]
+        self._regimes = np.array(regimes)
+        self._stations = [source.station_at(t) for t in regimes]
+        self._rotations = [rotation(station, source.report) for station in self._stations]
         self.units: dict[str, str] = {}
-        for t, station in self._stations.items():
+        for station, weights in zip(self._stations, self._rotations, strict=True):
             if station.pressure is not None:
                 self.units["p"] = "Pa" if self._known(station.pressure) else "count"
-            for name in self._rotations[t]:
+            for name in weights:
                 self.units[name] = "m/s" if all(map(self._known, station.motion)) else "count"
         if not self.units:
             raise StationError(
@@ -208,20 +218,17 @@ class _FrontEnd:
         """Dataset of the given (consecutive) frames."""
         starts = frames * self.config.hop_ns
         centres = starts + self.config.window_ns // 2
-        variables = {name: np.empty((frames.size, self.frequency.size), np.complex64) for name in self.units}
-        regimes = np.array(sorted(self._stations))
-        owner = np.clip(np.searchsorted(regimes, centres, "right") - 1, 0, None)
-        for j in np.unique(owner):
-            mine = owner == j
-            made = self._components(int(regimes[j]), starts[mine])
-            for name, target in variables.items():
-                target[mine] = made.get(name, np.complex64(complex(np.nan, np.nan)))
-        data = {
-            name: (("frequency", "time"), array.T, {"units": self.units[name]})
-            for name, array in variables.items()
-        }
+        owner = np.maximum(np.searchsorted(self._regimes, centres, "right") - 1, 0)
+        if owner[0] == owner[-1]:
+            made = self._components(owner[0], starts)
+        else:
+            parts = [self._components(j, starts[owner == j]) for j in np.unique(owner)]
+            made = {name: np.concatenate([part[name] for part in parts]) for name in self.units}
         return xr.Dataset(
-            data,
+            {
+                name: (("frequency", "time"), made[name].T, {"units": unit})
+                for name, unit in self.units.items()
+            },
             {
                 "frequency": ("frequency", self.frequency, {"units": "Hz"}),
                 "time": ("time", centres.astype("datetime64[ns]")),
@@ -237,116 +244,14 @@ class _FrontEnd:
         )
 
     def _components(self, regime: int, starts: np.ndarray) -> dict[str, np.ndarray]:
+        """Arrays (frame, frequency) of all variables at frames under one set of metadata."""
         station, made = self._stations[regime], {}
         if station.pressure is not None:
-            made["p"] = self._channel(station.pressure, starts)
-        motion = [self._channel(channel, starts) for channel in station.motion]
+            made["p"] = self._channels.frames(station.pressure, starts)
+        motion = [self._channels.frames(channel, starts) for channel in station.motion]
         for name, weights in self._rotations[regime].items():
-            terms = [weight * array for weight, array in zip(weights, motion, strict=True) if weight != 0]
+            terms = [np.float32(w) * array for w, array in zip(weights, motion, strict=True) if w != 0]
             made[name] = sum(terms[1:], start=terms[0])
+        for name in self.units.keys() - made.keys():
+            made[name] = np.full((starts.size, self.frequency.size), np.complex64(complex(np.nan, np.nan)))
         return made
-
-    def _channel(self, channel: Channel, starts: np.ndarray) -> np.ndarray:
-        """Spectra (frame, frequency) of one channel in its own direction, in Pa or m/s."""
-        out = np.full((starts.size, self.frequency.size), np.complex64(complex(np.nan, np.nan)))
-        timeline = self.source.timelines[channel.seed_id]
-        for run in timeline.between(
-            int(starts[0]) - _SECOND, int(starts[-1]) + self.config.window_ns + _SECOND
-        ):
-            transform = self._transform(run.rate)
-            position = run.nearest(starts)
-            whole = np.flatnonzero((position >= 0) & (position + transform.count <= run.length))
-            if whole.size:
-                position = position[whole]
-                delay = run.delay(position + transform.count // 2, starts[whole]) - transform.middle_s
-                self._fill(out, whole, run, position, delay, channel, transform)
-        return out
-
-    def _fill(
-        self,
-        out: np.ndarray,
-        rows: np.ndarray,
-        run: Run,
-        position: np.ndarray,
-        delay: np.ndarray,
-        channel: Channel,
-        transform: FrameTransform,
-    ) -> None:
-        """Transform the frames that start at `position` in `run` into `out[rows]`."""
-        count, still = transform.count, max(round(self.config.dead_s * run.rate), 2)
-        low, high = (
-            max(int(position[0]) - 2 * still, 0),
-            min(int(position[-1]) + count + 2 * still, run.length),
-        )
-        samples = run.read(low, high)
-        position = position - low
-        dead = touched(constant(samples, still), position, count)
-        views = np.lib.stride_tricks.sliding_window_view(samples, count)
-        factor = (self._inverse(channel) * transform.scale).astype(np.complex64)
-        stuck = np.zeros(rows.size, bool)
-        for batch in range(0, rows.size, _BATCH):
-            chosen = slice(batch, batch + _BATCH)
-            cut = views[position[chosen]].astype(np.float64)
-            stuck[chosen] = clipped(cut, self.config.clip_share)
-            out[rows[chosen]] = transform(cut) * factor * self._turn(delay[chosen])
-        out[rows[dead | stuck]] = complex(np.nan, np.nan)
-        report = self.source.report.channels.get(channel.seed_id)
-        if report is not None:
-            report.dead_frames += int(dead.sum())
-            report.clipped_frames += int((stuck & ~dead).sum())
-
-    def _turn(self, delay: np.ndarray) -> np.ndarray | np.complex64:
-        """Phase that undoes the lateness [s] of the samples, one row a frame."""
-        if np.max(np.abs(delay)) < _DELAY_TOLERANCE_S:
-            return np.complex64(1)
-        distinct = delay[:1] if np.ptp(delay) < _DELAY_TOLERANCE_S else delay
-        return np.exp(-2j * np.pi * distinct[:, None] * self.frequency).astype(np.complex64)
-
-    def _transform(self, rate: float) -> FrameTransform:
-        key = round(rate, 4)
-        if key not in self._transforms:
-            self._transforms[key] = FrameTransform(rate, self.config.window_s, self.frequency.size)
-        return self._transforms[key]
-
-    def _inverse(self, channel: Channel) -> np.ndarray:
-        """Physical units per count at each frequency, polarity included, no further than the water level."""
-        if channel not in self._inverses:
-            response = channel.polarity * frequency_response(
-                channel.response, self.frequency, channel.kind, channel.seed_id
-            )
-            size = np.abs(response)
-            level = size[1:].max(initial=0.0) * 10 ** (-self.config.water_level_db / 20)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = np.conj(response) / (size * np.maximum(size, level))
-            self._inverses[channel] = np.where(size > 0, inverse, 0)
-        return self._inverses[channel]
-
-
-def _rotation(station: Station, source: WaveformSource) -> dict[str, np.ndarray]:
-    """Weights of the motion channels in east, north and down, as far as they determine them."""
-    motion = station.motion
-    flat = [i for i, channel in enumerate(motion) if channel.horizontal]
-    steep = [i for i, channel in enumerate(motion) if not channel.horizontal]
-    if len(flat) < 2:
-        if flat:
-            source.report.note(f"{motion[flat[0]].seed_id} is the only horizontal: no azimuth")
-        weights = {"down": np.zeros(len(motion))} if steep else {}
-        for name in weights:
-            weights[name][steep[0]] = 1.0 / motion[steep[0]].direction[2]
-        return weights
-    for i in flat:
-        if motion[i].azimuth_deg is None:
-            raise StationError(f"{motion[i].seed_id} has no azimuth in its StationXML; give --orientation")
-    used = flat + steep if len(motion) == 3 else flat
-    directions = np.array([motion[i].direction for i in used])[:, : len(used)]
-    if abs(np.linalg.det(directions)) < 0.1:
-        ids = " and ".join(motion[i].seed_id for i in flat)
-        angles = " and ".join(f"{motion[i].azimuth_deg:g}°" for i in flat)
-        raise StationError(f"{ids} point along {angles}: they are not independent; give --orientation")
-    inverse = np.linalg.inv(directions)
-    inverse[np.abs(inverse) < 1e-9] = 0.0
-    names = ("east", "north", "down")[: len(used)]
-    weights = {name: np.zeros(len(motion)) for name in names}
-    for name, row in zip(names, inverse, strict=True):
-        weights[name][used] = row
-    return weights

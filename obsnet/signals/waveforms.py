@@ -21,10 +21,11 @@ from obsnet.layout import iso
 from obsnet.signals.files import FileReader, list_files, trace_piece
 from obsnet.signals.records import RecordReader
 from obsnet.signals.station import Station
-from obsnet.signals.timeline import Piece, Timeline
+from obsnet.signals.timeline import Overlap, Piece, Timeline
 
 _SECOND = 1_000_000_000
 _RATE_TOLERANCE = 1e-3
+_EARLIEST_NS, _LATEST_NS = -2_208_988_800 * _SECOND, 7_258_118_400 * _SECOND
 _CHECKED_OVERLAPS = 20
 _CHECKED_S = 60.0
 
@@ -96,6 +97,17 @@ class WaveformSource:
         if self.begin_ns >= last or self.end_ns <= first:
             found = f"they span {_iso(first)} to {_iso(last)}"
             raise WaveformError(f"{station.code} has no waveforms {_span(begin_ns, end_ns)}; {found}")
+
+    def covered(self, silence_ns: int) -> list[tuple[int, int]]:
+        """Spans that any channel covers, silences of up to `silence_ns` included; ns since 1970."""
+        spans: list[tuple[int, int]] = []
+        runs = (run for timeline in self.timelines.values() for run in timeline.runs)
+        for begin, end in sorted((run.begin_ns, run.end_ns) for run in runs):
+            if spans and begin - spans[-1][1] <= silence_ns:
+                spans[-1] = (spans[-1][0], max(spans[-1][1], end))
+            else:
+                spans.append((begin, end))
+        return spans
 
     def station_at(self, time_ns: int) -> Station:
         """The station with the channels that have waveforms and an epoch at a time."""
@@ -218,7 +230,7 @@ def _slice(data: np.ndarray, first: int, last: int) -> np.ndarray:
 def _from_files(
     paths: list[Any], station: Station, begin: int | None, end: int | None, report: WaveformReport
 ) -> Iterator[tuple[str, Piece]]:
-    records, others = RecordReader(report.note), FileReader()
+    records, others = RecordReader(report.note), FileReader(report.note)
     for path in list_files(paths, station, begin, end):
         report.files += 1
         try:
@@ -251,6 +263,8 @@ def _sort(
         own = _match(seed_id, known)
         if own is None:
             report.left_aside[seed_id] = f"not described for {station.code}"
+        elif not _EARLIEST_NS < piece.start_ns < _LATEST_NS:
+            report.left_aside[seed_id] = "dated outside 1900 to 2200"
         elif piece.rate < min_rate_hz * (1 - _RATE_TOLERANCE):
             report.left_aside[seed_id] = f"sampled at {piece.rate:g} Hz, below the {min_rate_hz:g} Hz needed"
         else:
@@ -305,14 +319,14 @@ def _describe(timeline: Timeline) -> ChannelReport:
     )
 
 
-def _conflicts(timeline: Timeline, overlap: Any) -> bool:
+def _conflicts(timeline: Timeline, overlap: Overlap) -> bool:
+    """Whether the samples that were not used differ from those that were, over the first minute."""
     late = overlap.late
-    first = late.first
     for run in timeline.between(overlap.begin_ns, overlap.end_ns):
-        position = int(run.nearest(np.array([late.time_ns(first)]))[0])
+        position = int(run.nearest(np.array([late.begin_ns]))[0])
         if 0 <= position < run.length:
-            wanted = int(float(late.index(overlap.end_ns))) - first
-            count = min(wanted, run.length - position, int(_CHECKED_S * late.rate))
-            same = np.array_equal(run.read(position, position + count), late.read(first, first + count))
-            return not same
+            wanted = int(float(late.index(overlap.end_ns))) - late.first
+            count = max(min(wanted, run.length - position, int(_CHECKED_S * late.rate)), 0)
+            used = run.read(position, position + count)
+            return not np.array_equal(used, late.read(late.first, late.first + count))
     return False

@@ -81,7 +81,8 @@ def test_a_symmetric_fir_has_no_phase_however_it_is_declared():
     for symmetry, given in (("NONE", taps), ("ODD", taps[:3])):
         stage = FIRResponseStage(
             1, 1.0, 0.0, "PA", "COUNTS", symmetry, coefficients=list(given), decimation_factor=2,
-            decimation_input_sample_rate=100.0, decimation_offset=0, decimation_delay=0.02, decimation_correction=0.02,
+            decimation_input_sample_rate=100.0, decimation_offset=0, decimation_delay=0.02,
+            decimation_correction=0.02,
         )  # fmt: skip
         np.testing.assert_allclose(
             frequency_response(respond(stage), FREQUENCY, "pressure"), expected, rtol=1e-12, atol=1e-14

@@ -209,6 +209,27 @@ def test_nan_samples_are_a_gap():
     np.testing.assert_array_equal(got.all(axis=0), got.any(axis=0))
 
 
+def test_a_silence_of_years_is_passed_over():
+    full = Tones(5).trace()
+    early = full.copy()
+    early.stats.starttime -= 33 * 365 * 86400
+    source = open_waveforms(obspy.Stream([full, early]), P)
+    got = spectra(source, P)
+    assert got.sizes["time"] == 2 * spectra(full, P).sizes["time"]
+    assert not np.isnan(got["p"].values).any()
+    assert any("passed over" in note for note in source.report.notes)
+
+
+def test_infinite_samples_are_a_gap_without_a_warning():
+    item = Tones(5).trace()
+    item.data[5000] = np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        got = np.isnan(spectra(item, P)["p"].values)
+    assert 1 <= got.all(axis=0).sum() <= 2
+    np.testing.assert_array_equal(got.all(axis=0), got.any(axis=0))
+
+
 def test_channels_that_start_and_end_apart_are_aligned():
     stream = four_channels(0.5)
     whole = spectra(stream, FOUR)
@@ -370,7 +391,7 @@ def test_the_water_level_bounds_what_is_undone():
     response = obspy.core.inventory.Response(response_stages=[stage])
     station = Station.from_stationxml(inventory([channel("BDH", response=response)]))
     item = trace(np.random.default_rng(0).normal(size=6000))
-    gain = np.abs(spectra(item, station)["p"].values / spectra(item, P)["p"].values)[1:-1]
+    gain = np.abs(spectra(item, station)["p"].values[1:-1] / spectra(item, P)["p"].values[1:-1])
     s = 2j * np.pi * np.arange(1, 512) / 20.48
     shape = np.abs(s / (s + corner)) ** 3
     top = np.abs(2j * np.pi * 25 / (2j * np.pi * 25 + corner)) ** 3
