@@ -32,6 +32,9 @@ class StationTrackerConfig:
         Time between the rows of the maps.
     acceleration_mps2 : float
         Standard deviation of each component of the ship's acceleration, constant within an interval.
+    scale_drift : float
+        While there is no range map, position and velocity are scaled together by a random factor of this
+        relative size per interval: azimuths do not tell it, and a few particles would pretend to know it.
     speed_std_mps : float
         Spread of each component of a newborn ship's velocity that the maps do not tell.
     max_range_m : float
@@ -45,6 +48,7 @@ class StationTrackerConfig:
 
     interval_s: float = 60.0
     acceleration_mps2: float = 2e-3
+    scale_drift: float = 0.03
     speed_std_mps: float = 6.0
     max_range_m: float = 50e3
     azimuth_detection: float = 0.9
@@ -59,10 +63,12 @@ class StationTrackerConfig:
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)!r}")
         if not (
-            0 < self.azimuth_detection <= 1 and 0 < self.range_detection <= 1 and self.acceleration_mps2 >= 0
+            0 < self.azimuth_detection <= 1
+            and 0 < self.range_detection <= 1
+            and min(self.acceleration_mps2, self.scale_drift) >= 0
         ):
             raise ConfigError(
-                "detection probabilities must lie in (0, 1] and the acceleration must not be negative"
+                "detection probabilities must lie in (0, 1], acceleration and drift not be negative"
             )
 
 
@@ -156,7 +162,8 @@ class StationTracker:
         rng = np.random.default_rng([self._seed, self._row])
         births = self._births(rng)
         likelihood = None if row is None and chart is None else lambda states: self._llr(states, row, chart)
-        self._filter.step(lambda states: self._moved(states, rng), births, likelihood, rng)
+        drift = config.scale_drift if chart is None else 0.0
+        self._filter.step(lambda states: self._moved(states, drift, rng), births, likelihood, rng)
         self._previous = (row, chart)
         return self.existence
 
@@ -244,10 +251,11 @@ class StationTracker:
         distance = self._range[i] + near * (rng.random(count) - 0.5)
         return np.maximum(distance, 1.0), self._rate[j] + slow * (rng.random(count) - 0.5)
 
-    def _moved(self, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _moved(self, states: np.ndarray, drift: float, rng: np.random.Generator) -> np.ndarray:
         interval = self.config.interval_s
         kick = self.config.acceleration_mps2 * interval * rng.standard_normal((2, states.shape[1]))
-        return np.concatenate([states[:2] + interval * (states[2:] + 0.5 * kick), states[2:] + kick])
+        moved = np.concatenate([states[:2] + interval * (states[2:] + 0.5 * kick), states[2:] + kick])
+        return moved if drift == 0.0 else moved * np.exp(drift * rng.standard_normal(states.shape[1]))
 
 
 @dataclass(frozen=True)
