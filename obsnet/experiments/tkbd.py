@@ -71,9 +71,9 @@ class Contender:
 # obsnet.experiments.tkbd.calibrate(seed=1, hours=8.0, jobs=2)
 CONTENDERS = (
     Contender("TVAR14", 14, "t", -20.0),
-    Contender("TVAR0", 0, "t", -10.0),
-    Contender("GVAR14", 14, "gaussian", -7.0),
-    Contender("CFAR", None, "detections", 8.5),
+    Contender("TVAR0", 0, "t", -1.0),
+    Contender("GVAR14", 14, "gaussian", -6.0),
+    Contender("CFAR", None, "detections", 16.0),
     Contender("CFARVAR14", 14, "detections", 1.0),
 )
 MATCHED = Contender("TVAR14 matched", 14, "t", -20.0, matched=True)

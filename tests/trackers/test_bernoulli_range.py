@@ -13,7 +13,7 @@ PASSAGE = StraightCourse(cpa_time=2400.0, cpa_range_m=4000.0, course_deg=70.0, s
 
 
 def maps(rng, ghost_m=0.0):
-    """Gaussian bumps about the truth, 4 deg, 400 m and 1 m/s wide; a second branch in range `ghost_m` further."""
+    """Gaussian bumps about the truth, 4 deg, 400 m, 1 m/s wide; a second branch `ghost_m` further."""
     azimuth, distance, rate = PASSAGE.observables(MINUTES)
     azimuth, distance = azimuth + 3.0 * rng.normal(size=80), distance + 200.0 * rng.normal(size=80)
     seen = wrap180(AZIMUTH - azimuth[:, None])

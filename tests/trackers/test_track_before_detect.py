@@ -15,7 +15,7 @@ CONFIG = BearingTrackerConfig(INTERVAL, bernoulli=BernoulliConfig(particles=400,
 
 
 def likelihoods(rng, snr_db, batches=400, start=100):
-    """White noise on a line array; from batch `start` a white source that turns from -20 deg at 0.05 deg/s."""
+    """White noise on a line; from batch `start` a white source that turns from -20 deg at 0.05 deg/s."""
     beams = Beamformer(HydrophoneArray.line(M, 0.93), RATE, N, np.arange(-90.0, 91.0, 2.0), 750.0)
     azimuth = -20.0 + 0.05 * INTERVAL * (np.arange(batches) - start)
     azimuth[:start] = np.nan
