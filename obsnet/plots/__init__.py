@@ -1,0 +1,5 @@
+"""Pictures of a run: the report, and the core paper's figures 3, 5, 6, 7 and 8."""
+
+from obsnet.plots.report import report
+
+__all__ = ["report"]
