@@ -24,7 +24,7 @@ from obsnet.detectors.maps import LikelihoodMaps, detections, presence
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import propagation
+from obsnet.ocean.rays import propagation_table
 from obsnet.ocean.sound_speed import OceanConfig
 from obsnet.signals.azigram import AzigramConfig, azigram
 from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstrogram
@@ -71,7 +71,8 @@ class Pipeline:
     ----------
     station : Station; its depth and the ocean's profile make the propagation table.
     config : RunConfig
-    amplitudes : strength of each path pair against range; by default the paper's Table II scaled to the depth.
+    amplitudes : strength of each path pair against range; by default the paper's Table II, carried on
+        and scaled to the depth.
     table : propagation table, if it is not to be made from `config.ocean`.
     """
 
@@ -84,13 +85,8 @@ class Pipeline:
         threads: int | None = None,
     ) -> None:
         self.station, self.config = station, config
-        ocean = config.ocean
-        self.table = (
-            table
-            if table is not None
-            else propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
-        )
-        amplitudes = amplitudes or Amplitudes.table_ii().scaled_to(station.depth_m)
+        self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
+        amplitudes = amplitudes or Amplitudes.default().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
         self._range = AnalyticRangeDetector(self.table, amplitudes, config.range, threads)
         self._clutter = ClutterFilter(config.cepstrogram)

@@ -199,7 +199,8 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
     for segment in found:
         window = slice(from_posix(segment.start - 1.0), from_posix(segment.end + 1.0))
         part = run.maps.sel(time=window).load()
-        tracks += search(part, segment, delay, run.config.grid_search, threads)
+        near = [known for known in tracks if known.end > segment.start - 3600.0]
+        tracks += search(part, segment, delay, run.config.grid_search, threads, near)
     return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
 
 

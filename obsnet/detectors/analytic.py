@@ -89,7 +89,7 @@ class RangeDetectorConfig:
     centre_frequency_hz: float = 15.0
     pulse_width_s: float = 0.05
     pulse: Literal["text", "scripts"] = "text"
-    pairs: tuple[str, ...] = ("1-3", "3-5", "5-7")
+    pairs: tuple[str, ...] = ("1-3", "3-5", "5-7", "7-9", "9-11")
 
     def __post_init__(self) -> None:
         _check_windows(self.window_s, self.step_s)
@@ -313,7 +313,7 @@ def cepstral_model(
 
     Returns
     -------
-    array (n_pairs, n_range, n_quefrency); zero where a path does not exist or is unheard, and
+    array (n_pairs, n_range, n_quefrency); zero where a path does not exist, a pair has no amplitude, and
     beyond four pulse widths.
 
     Notes
@@ -326,6 +326,8 @@ def cepstral_model(
     factor = 2.0 if config.pulse == "text" else 1.0
     model = np.zeros((len(config.pairs), len(range_m), len(quefrency_s)))
     for p, pair in enumerate(config.pairs):
+        if pair not in amplitudes.pairs:
+            continue
         delay = tdoa(propagation, pair).interp(range=range_m).values
         phase = _interp_phase(phase_difference(propagation, pair), range_m)
         lag = np.asarray(quefrency_s)[None, :] - delay[:, None]

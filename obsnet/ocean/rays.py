@@ -6,7 +6,7 @@ Path k crosses the water column k = 1, 3, 5, … times: before it arrives it has
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from obsnet.layout import PROPAGATION, require
 from obsnet.ocean.bottom import Bottom
 from obsnet.ocean.sound_speed import OceanConfig, SoundSpeed
 
-PATHS = (1, 3, 5, 7, 9)
+PATHS = (1, 3, 5, 7, 9, 11)
 STEEP_RAYS, GRAZING_RAYS = 1200, 300
 
 
@@ -227,6 +227,28 @@ def strongest_delay(table: xr.Dataset, range_m: np.ndarray | None = None) -> xr.
     delay = table["delay"].transpose("path", "range").values
     strongest = np.take_along_axis(delay, strength.argmax(axis=0)[None], axis=0)[0]
     return xr.DataArray(strongest, {"range": table["range"]}, ("range",), "delay", {"units": "s"})
+
+
+def travel_time(table: xr.Dataset) -> Callable[[np.ndarray], np.ndarray]:
+    """Travel time [s] of the loudest path as a function of range [m], going on straight beyond the table.
+
+    Raises
+    ------
+    LayoutError
+        No path exists in the table at two ranges.
+    """
+    delay = strongest_delay(table)
+    exists = np.isfinite(delay.values)
+    grid, values = delay["range"].values[exists].astype(float), delay.values[exists]
+    if grid.size < 2:
+        raise LayoutError("no path exists in the propagation table; check its depth and ranges")
+    slope = (values[-1] - values[-2]) / (grid[-1] - grid[-2])
+
+    def at(range_m: np.ndarray) -> np.ndarray:
+        distance = np.abs(np.asarray(range_m, float))
+        return np.interp(distance, grid, values) + slope * np.maximum(distance - grid[-1], 0.0)
+
+    return at
 
 
 def tdoa(table: xr.Dataset, pair: str, range_m: np.ndarray | None = None) -> xr.DataArray:

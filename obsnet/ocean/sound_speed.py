@@ -220,7 +220,7 @@ class OceanConfig:
     bottom: Bottom = field(default_factory=Bottom)
     max_range_m: float = 100_000.0
     range_step_m: float = 70.0
-    paths: tuple[int, ...] = (1, 3, 5, 7, 9)
+    paths: tuple[int, ...] = (1, 3, 5, 7, 9, 11)
 
     def __post_init__(self) -> None:
         if self.profile not in ("munk", "constant", "table"):

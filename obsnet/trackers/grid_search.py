@@ -7,7 +7,7 @@ the ship when the sound left it (paper's eq. 26, the travel time undone). The se
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +28,9 @@ from obsnet.trackers.track import Segment, Track
 class GridSearchConfig:
     """Prior, likelihood and levels of the grid search.
 
-    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach.
+    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
+    and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
+    reach `min_log_bayes_factor_next`, since what is left of the first is not noise.
     """
 
     azimuth_detection_probability: float = 0.9
@@ -42,6 +44,8 @@ class GridSearchConfig:
     candidates: int = 6
     max_ships: int = 4
     min_log_bayes_factor: float = 10.0
+    min_log_bayes_factor_next: float = 60.0
+    still_deg_per_hour: float = 4.0
     samples: int = 3000
     seed: int = 0
 
@@ -95,6 +99,7 @@ def search(
     delay: Callable[[np.ndarray], np.ndarray],
     config: GridSearchConfig = GridSearchConfig(),
     threads: int = 1,
+    known: Sequence[Track] = (),
 ) -> list[Track]:
     """Tracks of the ships heard within a segment, strongest first; none if nothing speaks for a ship.
 
@@ -104,6 +109,7 @@ def search(
     segment : Segment, s since 1970.
     delay : travel time [s] of the sound against range [m].
     config : GridSearchConfig
+    known : tracks found before, in neighbouring segments; what they explain is left out.
 
     Returns
     -------
@@ -116,12 +122,16 @@ def search(
         return []
     times, azimuth_llr, range_llr = tiles
     finder = _Finder(maps, times, segment, delay, config, threads)
+    for track in known:
+        azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
     tracks: list[Track] = []
     for number in range(config.max_ships):
         track = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
-        if track is None or track.log_bayes_factor < config.min_log_bayes_factor:
+        least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
+        if track is None or track.log_bayes_factor < least:
             break
-        tracks.append(track)
+        if finder.believable(track):
+            tracks.append(track)
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
     return tracks
 
@@ -268,6 +278,7 @@ class _Finder:
             cov = (weight * deviation.T) @ deviation + np.diag([1.0, 10.0, 0.05, 0.005]) ** 2
         score, per_tile = self._score_points(best[None], scores, keep_tiles=True)
         lo, hi = _best_run(per_tile[:, 0])
+        fixed = self._fixed_source(scores, lo, hi)
         n = len(self.tiles)
         span = self.tiles[-1] + 3600.0
         volume = span * 2 * config.max_cpa_range_m * (config.max_speed_mps - config.min_speed_mps)
@@ -279,9 +290,32 @@ class _Finder:
         motion = StraightCourse(self.origin + mean[0], float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
         method = "grid search" if self.sees_course and self.sees_range else _blind(self.sees_course)
         start, end = self.origin + self.tiles[lo], self.origin + self.tiles[hi]
+        extra = {"score": float(score[0]), "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed)}
         return Track(
-            float(start), float(end), motion, cov, log_bayes_factor, method, {"score": float(score[0])}
+            float(start), float(end), motion, cov, log_bayes_factor, method, extra
         )
+
+    def _fixed_source(self, scores: _Scores, lo: int, hi: int) -> float:
+        """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
+        if not self.sees_course:
+            return 0.0
+        tiles = np.arange(lo, hi + 1)
+        hours = (self.tiles[tiles] - self.tiles[tiles].mean()) / 3600.0
+        bins = scores.azimuth_score.shape[1]
+        azimuth = np.arange(bins)
+        best = -np.inf
+        for drift in np.linspace(-self.config.still_deg_per_hour, self.config.still_deg_per_hour, 9):
+            shift = np.round(drift * hours / scores.azimuth_step).astype(int)
+            best = max(best, scores.azimuth_score[tiles, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
+        return float(best)
+
+    def believable(self, track: Track) -> bool:
+        """Whether a track moves as a ship does, and lies within the prior rather than against its edge."""
+        config = self.config
+        slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
+        within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
+        within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
+        return within_speed and within_range and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
