@@ -142,7 +142,9 @@ def octave_energies(recording: Recording, config: DetectorConfig) -> tuple[np.nd
     return energy, 2.0 * bins**2 / neighbours
 
 
-def exceedances(energy: np.ndarray, freedom: np.ndarray, hop_s: float, config: DetectorConfig) -> np.ndarray:
+def exceedances(
+    energy: np.ndarray, freedom: np.ndarray, hop_s: float, config: DetectorConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Windows and octaves above the adaptive threshold of one hydrophone.
 
     The background follows the energy with `memory_s` and is frozen in all octaves while one of them exceeds.
@@ -154,11 +156,12 @@ def exceedances(energy: np.ndarray, freedom: np.ndarray, hop_s: float, config: D
 
     Returns
     -------
-    bool array (window, octave)
+    over : bool array (window, octave)
+    background : array (window, octave), against which each window was held.
     """
     energy = np.asarray(energy, np.float64)
     if not len(energy):
-        return np.zeros(energy.shape, bool)
+        return np.zeros(energy.shape, bool), np.zeros(energy.shape)
     if config.margin is None:
         ratio = chi2.isf(config.false_alarm, freedom) / freedom
     else:
@@ -178,16 +181,19 @@ def arrivals(recording: Recording, config: DetectorConfig) -> list[Arrival]:
     bands = config.octaves(recording.sampling_rate)
     found: list[Arrival] = []
     for hydrophone in range(recording.count):
-        over = exceedances(energy[:, hydrophone], freedom, hop / recording.sampling_rate, config)
+        over, background = exceedances(energy[:, hydrophone], freedom, hop / recording.sampling_rate, config)
         active = np.concatenate([[False], over.any(axis=1), [False]])
         edges = np.flatnonzero(np.diff(active.astype(np.int8)))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             octaves = np.flatnonzero(over[begin:end].any(axis=0))
             start, stop = begin * hop, (end - 1) * hop + size
-            series = recording.segment(start, stop)[hydrophone]
-            for sample, snr_db in _peaks(
-                series, recording.sampling_rate, [bands[k] for k in octaves], config
-            ):
+            filtered = _whitened(
+                recording.segment(start, stop)[hydrophone],
+                recording.sampling_rate,
+                [bands[k] for k in octaves],
+                background[begin, octaves] / freedom[octaves],
+            )
+            for sample, snr_db in _peaks(filtered, recording.sampling_rate, config):
                 time = (start + sample) / recording.sampling_rate
                 found.append(Arrival(time, hydrophone, frozenset(octaves.tolist()), snr_db))
     return sorted(found, key=lambda arrival: (arrival.time, arrival.hydrophone))
@@ -225,16 +231,20 @@ def _samples(recording: Recording, config: DetectorConfig) -> tuple[int, int]:
     return size, max(round(config.hop_s * recording.sampling_rate), 1)
 
 
-def _peaks(
-    series: np.ndarray, sampling_rate: float, bands: list[tuple[float, float]], config: DetectorConfig
-) -> list[tuple[int, float]]:
-    """Samples at which the 1 ms energy in the bands peaks, and their SNR [dB] over the stretch's median."""
+def _whitened(
+    series: np.ndarray, sampling_rate: float, bands: list[tuple[float, float]], density: np.ndarray
+) -> np.ndarray:
+    """Samples in the bands, each over its background, so that a loud low octave does not hide the click."""
     spectrum = rfft(np.nan_to_num(series))
     frequency = np.arange(len(spectrum)) * sampling_rate / len(series)
-    keep = np.zeros(len(spectrum), bool)
-    for low, high in bands:
-        keep |= (frequency >= low) & (frequency < high)
-    filtered = irfft(spectrum * keep, len(series))
+    gain = np.zeros(len(spectrum))
+    for (low, high), power in zip(bands, density, strict=True):
+        gain[(frequency >= low) & (frequency < high)] = 1.0 / np.sqrt(max(power, 1e-30))
+    return irfft(spectrum * gain, len(series))
+
+
+def _peaks(filtered: np.ndarray, sampling_rate: float, config: DetectorConfig) -> list[tuple[int, float]]:
+    """Samples at which the 1 ms energy peaks, and its height [dB] over the stretch's median."""
     envelope = uniform_filter1d(filtered**2, max(round(ENVELOPE_S * sampling_rate), 1), mode="constant")
     top, floor = envelope.max(), np.median(envelope)
     height = max(SECOND_ARRIVAL * top, 5.0 * floor)
@@ -247,8 +257,10 @@ def _peaks(
 def _adapt(energy, background, ratio, pace, longest):
     frames, octaves = energy.shape
     over = np.zeros((frames, octaves), np.bool_)
+    level = np.empty((frames, octaves))
     running = 0
     for t in range(frames):
+        level[t] = background
         finite = True
         for k in range(octaves):
             finite = finite and np.isfinite(energy[t, k])
@@ -271,4 +283,4 @@ def _adapt(energy, background, ratio, pace, longest):
             else:
                 background[k] += pace * (energy[t, k] - background[k])
         running = 0
-    return over
+    return over, level
