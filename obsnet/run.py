@@ -22,12 +22,13 @@ import xarray as xr
 
 import obsnet
 from obsnet import netcdf
-from obsnet.config import to_dict
+from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps
-from obsnet.errors import OutputError
+from obsnet.errors import LayoutError, OutputError
+from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix, iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import strongest_delay
+from obsnet.ocean.rays import propagation, strongest_delay
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
@@ -423,3 +424,69 @@ def _version(package: str) -> str:
     from importlib.metadata import version
 
     return version(package)
+
+
+def read_run(folder: str | Path) -> Run:
+    """The run in a folder of ``obsnet track``; maps stay on disk until they are looked at.
+
+    The station comes back without channels, tracks with variances only: infinite where tracks.csv is empty.
+
+    Raises
+    ------
+    LayoutError : the folder is not one of a run, or a file of it is missing or damaged.
+    """
+    folder = Path(folder)
+    try:
+        found = pd.read_csv(folder / "detections.csv", dtype={"time": str}).reindex(columns=DETECTION_COLUMNS)
+        found["time"] = found["time"].str.removesuffix("Z").to_numpy("datetime64[ns]")
+        found = found.astype(dict.fromkeys(DETECTION_COLUMNS[1:], float))
+        rows = pd.read_csv(folder / "tracks.csv").reindex(columns=TRACK_COLUMNS)
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        code, *place = (info["station"][key] for key in ("code", "latitude", "longitude", "depth_m"))
+        station, config = Station(code, *place), build(RunConfig, info["config"])
+        maps, features = (_minutes(folder / f"{name}.nc", len(found)) for name in ("maps", "features"))
+        spans = [
+            Segment(*(s[key] and _seconds(s[key]) for key in ("start", "end", "cpa")))
+            for s in info["segments"]
+        ]
+        tracks = [_track_of_row(row) for _, row in rows.iterrows()]
+    except FileNotFoundError as error:
+        missing = Path(error.filename).name if folder.is_dir() else "the folder"
+        raise LayoutError(f"{folder} is not a folder of `obsnet track`: {missing} is missing") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise LayoutError(
+            f"{folder} does not hold a run of this obsnet ({reason}); run obsnet track again"
+        ) from None
+    names = {"azimuth_llr": "azimuth", "range_llr": "range"}
+    ratios = found.set_index(to_posix(found["time"].to_numpy()))[list(names)].rename(columns=names)
+    ocean = config.ocean
+    table = propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
+    return Run(
+        station, config, maps, features, found, ratios.dropna(axis=1, how="all"), spans, tracks, table, info
+    )
+
+
+def _minutes(path: Path, count: int) -> xr.Dataset:
+    """A file of maps or features that holds `count` minutes; a run without minutes has none."""
+    if count == 0:
+        return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
+    path.stat()
+    dataset = netcdf.join_complex(netcdf.read(path))
+    if dataset.sizes["time"] != count:
+        raise ValueError(f"{path.name} holds {dataset.sizes['time']} minutes, detections.csv {count}")
+    return dataset
+
+
+def _track_of_row(row: pd.Series) -> Track:
+    start, end, cpa = (_seconds(row[key]) for key in ("start", "end", "cpa_time"))
+    starboard = wrap180(row["cpa_azimuth_deg"] - row["course_deg"]) < 0
+    distance = -row["cpa_distance_m"] if starboard else row["cpa_distance_m"]
+    std = row[["cpa_time_std_s", "cpa_distance_std_m", "course_std_deg", "speed_std_mps"]].astype(float)
+    course = 0.0 if np.isnan(row["course_deg"]) else float(row["course_deg"])
+    motion = StraightCourse(cpa, float(distance), course, float(row["speed_mps"]))
+    return Track(start, end, motion, np.diag(std.fillna(np.inf) ** 2), float(row["log_bayes_factor"]))
+
+
+def _seconds(text: str) -> float:
+    return float(to_posix(np.datetime64(text.removesuffix("Z"))))
