@@ -84,6 +84,7 @@ class ChannelSpectra:
         report = self._source.report.channels[channel.seed_id]
         report.dead_frames += int(dead.sum())
         report.clipped_frames += int((stuck & ~dead).sum())
+        report.transform = transform.name
         return out
 
     def _turn(self, spectra: np.ndarray, late: np.ndarray) -> None:

@@ -36,6 +36,8 @@ class FrameTransform:
         Time of sample `count // 2` after the frame's start, as the transform takes it, s.
     scale : ndarray
         Factor at each frequency that makes the modulus the amplitude of a tone.
+    name : str
+        What is done, for reports.
     """
 
     def __init__(self, rate: float, window_s: float, bins: int) -> None:
@@ -51,6 +53,8 @@ class FrameTransform:
         self.scale[0] /= 2
         if self.count == 2 * (bins - 1):
             self.scale[-1] /= 2
+        cut = "" if self.count == 2 * (bins - 1) else f" cut at {(bins - 1) / window_s:g} Hz"
+        self.name = ("chirp-z transform" if self._chirp else "FFT") + cut
         if self._chirp:
             self._prepare_chirp(period)
 

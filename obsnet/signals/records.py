@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 import obspy
+from obspy.io.mseed import InternalMSEEDWarning
 
 from obsnet.errors import WaveformError
 from obsnet.signals.timeline import JOIN_SAMPLES, Piece
@@ -105,10 +106,14 @@ class RecordReader:
         """Samples of consecutive records; a record that does not decode gives NaN, the others are kept."""
         expected = int(table["count"].sum())
         try:
+            raw = _gather(path, length, table["row"])
+        except OSError as error:
+            self._say(f"{path.name}: cannot be read any more ({error.strerror}); its samples are missing")
+            return np.full(expected, np.nan, np.float32)
+        try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                stream = obspy.read(io.BytesIO(_gather(path, length, table["row"])), format="MSEED")
-            parts = [trace.data for trace in stream]
+                warnings.simplefilter("error", InternalMSEEDWarning)
+                parts = [trace.data for trace in obspy.read(io.BytesIO(raw), format="MSEED")]
             if sum(part.size for part in parts) == expected:
                 return parts[0] if len(parts) == 1 else np.concatenate(parts)
         except (
@@ -116,14 +121,15 @@ class RecordReader:
         ):  # obspy raises what its C library reports; the halves below find the record at fault
             pass
         if table.size == 1:
-            if self._note is not None:
-                self._note(
-                    f"{path.name}: record {int(table['row'][0])} does not decode; its samples are missing"
-                )
+            self._say(f"{path.name}: some records do not decode; their samples are missing")
             return np.full(expected, np.nan, np.float32)
         middle = table.size // 2
         halves = (self._decode(path, length, half) for half in (table[:middle], table[middle:]))
         return np.concatenate(list(halves))
+
+    def _say(self, text: str) -> None:
+        if self._note is not None:
+            self._note(text)
 
 
 def scan(path: Path) -> RecordFile | None:

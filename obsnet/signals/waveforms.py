@@ -32,7 +32,7 @@ _CHECKED_S = 60.0
 
 @dataclass
 class ChannelReport:
-    """What became of one channel; times ISO 8601, durations in s, frames as counted by the spectra."""
+    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last three."""
 
     sampling_rate: float
     starttime: str
@@ -43,6 +43,7 @@ class ChannelReport:
     conflicting_overlaps: int = 0
     dead_frames: int = 0
     clipped_frames: int = 0
+    transform: str = ""
 
 
 @dataclass

@@ -140,7 +140,7 @@ def test_a_record_whose_samples_are_damaged_is_nan_and_the_others_are_read(tmp_p
     path.write_bytes(bytes(raw))
     said = []
     got = only(RecordReader(said.append), path).read(0, 16 * 300).reshape(16, 300)
-    assert said == ["damaged.mseed: record 7 does not decode; its samples are missing"]
+    assert said == ["damaged.mseed: some records do not decode; their samples are missing"]
     assert np.isnan(got[7]).all()
     keep = np.arange(16) != 7
     np.testing.assert_array_equal(got[keep], data[keep])

@@ -194,6 +194,26 @@ def test_a_location_code_or_network_code_that_differs_is_forgiven_and_said():
         open_waveforms(trace(noise(3000), location="07"), two)
 
 
+@pytest.mark.parametrize("form", ["MSEED", "SAC"])
+def test_a_file_that_vanishes_is_a_gap(tmp_path, form):
+    path = tmp_path / "record"
+    trace(noise(3000).astype(np.float32)).write(str(path), form)
+    source = open_waveforms(path, STATION)
+    path.unlink()
+    ((_, data),) = samples(source)
+    assert data.size == 3000
+    assert np.isnan(data).all()
+    assert len(source.report.notes) == 1
+    assert "record: " in source.report.notes[0]
+
+
+def test_impossible_dates_are_left_aside():
+    item = trace(noise(3000))
+    item.stats.starttime = obspy.UTCDateTime(2250, 1, 1)
+    report = open_waveforms(obspy.Stream([item, trace(noise(3000), "BHZ")]), STATION).report
+    assert report.left_aside == {BDH: "dated outside 1900 to 2200"}
+
+
 class Trap:
     """Leaves a mark when unpickled."""
 
