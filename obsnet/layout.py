@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from obsnet.errors import LayoutError
@@ -54,11 +55,11 @@ def to_posix(times: np.ndarray | np.datetime64) -> np.ndarray:
     return (np.asarray(times, "datetime64[ns]").astype("int64")) / 1e9
 
 
-def from_posix(seconds: np.ndarray | float) -> np.ndarray:
+def from_posix(seconds: npt.ArrayLike) -> np.ndarray:
     """`datetime64[ns]` of seconds since 1970-01-01 UTC.
 
-    >>> from_posix(60.0)
-    array('1970-01-01T00:01:00.000000000', dtype='datetime64[ns]')
+    >>> from_posix([60.0])
+    array(['1970-01-01T00:01:00.000000000'], dtype='datetime64[ns]')
     """
     return np.rint(np.asarray(seconds, float) * 1e9).astype("int64").astype("datetime64[ns]")
 

@@ -33,6 +33,9 @@ from obsnet.signals.station import Station
 from obsnet.trackers.grid_search import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
 
+LONG_SILENCE_S = 86400.0
+"""A silence longer than this has no rows; the record goes on after it as if it began there."""
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -98,17 +101,23 @@ class Pipeline:
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
         self._next: float | None = None
+        self._last: float | None = None
 
-    def push(self, spectra: xr.Dataset) -> Minutes | None:
-        """Take the next block of spectra; return the minutes that it finishes, or none."""
+    def push(self, spectra: xr.Dataset) -> list[Minutes]:
+        """Take the next block of spectra; return the minutes that it finishes, if any."""
         if not spectra.sizes["time"]:
-            return None
+            return []
         times = to_posix(spectra["time"].values)
+        finished: list[Minutes | None] = []
+        if self._last is not None and times[0] - self._last > LONG_SILENCE_S:
+            finished.append(self.flush())
+            self._azigram = self._null = self._cepstrogram = self._spectrogram = self._next = None
         if self._next is None:
             self._next = float(np.ceil(times[0] / self.config.azimuth.step_s) * self.config.azimuth.step_s)
         self._take(spectra)
-        ready = times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2
-        return self._finish(ready)
+        self._last = float(times[-1])
+        finished.append(self._finish(times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2))
+        return [minutes for minutes in finished if minutes is not None]
 
     def flush(self) -> Minutes | None:
         """Finish the last minutes of a record, whose windows reach beyond its end."""

@@ -12,7 +12,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
+from obsnet.trackers.bearings_only import track_bearings
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import Segment, Track
@@ -132,8 +133,6 @@ def track(
     ------
     ObsnetError : the waveforms, the station or the configuration cannot serve.
     """
-    from dataclasses import replace
-
     config = config or RunConfig()
     if detector is not None:
         config = replace(config, detector=detector)
@@ -179,13 +178,12 @@ def _run(
 def _stream(source, station, config, pipeline, progress, clock) -> Iterator[Minutes]:
     for spectra in iter_spectra(source, config.spectra):
         clock.lap("spectra")
-        minutes = pipeline.push(spectra)
+        finished = pipeline.push(spectra)
         clock.lap("detect")
         if progress is not None and spectra.sizes["time"]:
             done = float(to_posix(spectra["time"].values[-1])) - source.begin_ns / 1e9
             progress(done, (source.end_ns - source.begin_ns) / 1e9)
-        if minutes is not None:
-            yield minutes
+        yield from finished
     minutes = pipeline.flush()
     clock.lap("detect")
     if minutes is not None:
@@ -201,8 +199,40 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
         window = slice(from_posix(segment.start - 1.0), from_posix(segment.end + 1.0))
         part = run.maps.sel(time=window).load()
         near = [known for known in tracks if known.end > segment.start - 3600.0]
-        tracks += search(part, segment, delay, run.config.grid_search, threads, near)
+        new = search(part, segment, delay, run.config.grid_search, threads, near)
+        if not new and not near and not _range_heard(run, segment):
+            new = _by_bearings(run, segment, delay)
+        if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
+            new = [replace(track, method=f"{track.method}; course ambiguous by 180°") for track in new]
+        tracks += new
     return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
+
+
+def _range_heard(run: Run, segment: Segment) -> bool:
+    """Whether the range detector heard anything in a tenth of a segment's minutes."""
+    if "range" not in run.presence:
+        return False
+    inside = run.presence.loc[segment.start : segment.end, "range"]
+    return bool((inside > 0).mean() > 0.1)
+
+
+def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray]) -> list[Track]:
+    """Track from the azimuths alone, for a segment in which no range was heard; speed is then a prior's."""
+    inside = (run.presence.index >= segment.start) & (run.presence.index <= segment.end)
+    azimuth = run.detections["azimuth_deg"].to_numpy(float)[inside]
+    if np.isfinite(azimuth).sum() < 30 or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
+        return []
+    config = run.config.azimuth
+    found = track_bearings(
+        run.presence.index.to_numpy(float)[inside],
+        azimuth,
+        5.0,
+        correlation_s=config.window_s,
+        speed_mps=7.5,
+        speed_std_mps=2.0,
+        delay=delay,
+    )
+    return [] if found is None else [found]
 
 
 def travel_time(table: xr.Dataset) -> Callable[[np.ndarray], np.ndarray]:

@@ -172,7 +172,7 @@ class AnalyticAzimuthDetector:
             )  # fmt: skip
         covered = coverage(~np.isnan(real).all(axis=0), start, stop, minutes, config.window_s, hop)
         llr[covered == 0] = np.nan
-        return azimuth_maps(llr, covered, minutes, config.azimuth)
+        return azimuth_maps(llr, covered, minutes, config.azimuth, 360 // fold)
 
     def _tonal(self, real, imag, null, times, minutes, angle) -> np.ndarray:
         config = self.config
@@ -354,15 +354,16 @@ def null_density(phasor: np.ndarray, background: np.ndarray | None, cap: float =
 
 
 def azimuth_maps(
-    llr: np.ndarray, covered: np.ndarray, minutes: np.ndarray, azimuth: np.ndarray
+    llr: np.ndarray, covered: np.ndarray, minutes: np.ndarray, azimuth: np.ndarray, ambiguity_deg: int = 360
 ) -> xr.Dataset:
-    """Label an azimuth log-likelihood ratio (time, azimuth) as likelihood maps."""
+    """Label an azimuth log-likelihood ratio (time, azimuth), known up to `ambiguity_deg`, as likelihood maps."""
+    attrs = {"units": "degree", "ambiguity_deg": ambiguity_deg}
     return xr.Dataset(
         {
             "azimuth_llr": (("time", "azimuth"), llr.astype(np.float32), _LLR),
             "azimuth_coverage": ("time", covered, {"units": "1"}),
         },
-        coords={"time": from_posix(minutes), "azimuth": ("azimuth", azimuth, {"units": "degree"})},
+        coords={"time": from_posix(minutes), "azimuth": ("azimuth", azimuth, attrs)},
     )
 
 

@@ -53,6 +53,8 @@ def cepstrogram(spectra: xr.Dataset) -> xr.DataArray:
         raise LayoutError("a cepstrogram needs the hydrophone (p), which is missing from the spectra")
     frequency = spectra["frequency"].values
     modulus = np.abs(spectra["p"].values.T)
+    # The windowed mean is removed from every frame: its empty bin would put a constant into every quefrency.
+    modulus[:, 0] = modulus[:, 1]
     floor = np.finfo(np.float32).tiny
     log_modulus = np.log(np.maximum(modulus, floor))
     nfft = 2 * (frequency.size - 1)

@@ -30,7 +30,7 @@ class GridSearchConfig:
 
     `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
     and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
-    reach `min_log_bayes_factor_next`, since what is left of the first is not noise.
+    reach `min_log_bayes_factor_next`, since what is left of the first is not noise. A track must be heard for `shortest_s`.
     """
 
     azimuth_detection_probability: float = 0.9
@@ -46,6 +46,7 @@ class GridSearchConfig:
     min_log_bayes_factor: float = 10.0
     min_log_bayes_factor_next: float = 60.0
     still_deg_per_hour: float = 4.0
+    shortest_s: float = 3600.0
     samples: int = 3000
     seed: int = 0
 
@@ -314,8 +315,9 @@ class _Finder:
         config = self.config
         slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
         within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
+        long_enough = track.end - track.start >= config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
-        return within_speed and within_range and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
+        return long_enough and within_speed and within_range and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
