@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,97 +12,129 @@ import xarray as xr
 from obsnet.detectors.maps import range_rate_marginal
 from obsnet.layout import to_posix
 
-_SLICE = 2048
-_CELLS = 4_000_000
+_ROWS_AT_ONCE = 2048
+_CELLS_AT_ONCE = 4_000_000
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Equal columns over a stretch of time.
+    """Equal columns over a stretch of a run.
 
     Attributes
     ----------
     start, end : s since 1970, the outer edges.
     count : number of columns.
-    column : array (n_minutes), the column of each minute, increasing.
+    first : the run's minute that `column` begins with.
+    column : array (n_minutes), the column of each minute from `first` on, increasing.
     """
 
     start: float
     end: float
     count: int
+    first: int
     column: np.ndarray
 
     @classmethod
-    def over(cls, time: np.ndarray, most: int) -> Columns:
-        """Columns over minutes at `time` (`datetime64`, increasing), at most `most` of them."""
+    def over(cls, time: np.ndarray, most: int, start: float = -np.inf, end: float = np.inf) -> Columns | None:
+        """At most `most` columns over the minutes at `time` that lie in [start, end], or none without a minute.
+
+        Parameters
+        ----------
+        time : array of `datetime64`, increasing.
+        """
         seconds = to_posix(time)
+        first, last = np.searchsorted(seconds, start), np.searchsorted(seconds, end, side="right")
+        if first >= last:
+            return None
         step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 60.0
-        start, end = float(seconds[0]) - step / 2, float(seconds[-1]) + step / 2
-        count = max(1, min(most, round((end - start) / step)))
-        column = np.floor((seconds - start) / (end - start) * count + 1e-6).astype(int)
-        return cls(start, end, count, np.clip(column, 0, count - 1))
+        seconds = seconds[first:last]
+        begin, stop = float(seconds[0]) - step / 2, float(seconds[-1]) + step / 2
+        count = max(1, min(most, round((stop - begin) / step)))
+        column = np.floor((seconds - begin) / (stop - begin) * count + 1e-6).astype(int)
+        return cls(begin, stop, count, int(first), np.clip(column, 0, count - 1))
 
-    def mean(self, values: xr.DataArray) -> np.ndarray:
-        """Mean of `values` (time, cell) over each column's minutes with data, (column, cell); NaN where there are none.
+    @property
+    def centres(self) -> np.ndarray:
+        """Middle of each column, s since 1970."""
+        return self.start + (np.arange(self.count) + 0.5) * (self.end - self.start) / self.count
 
-        Read slice by slice, so that a month need not fit into memory.
+    def mean(
+        self, values: xr.DataArray, transform: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> np.ndarray:
+        """Mean over each column's minutes with data, (column, cell); NaN where there are none.
+
+        Parameters
+        ----------
+        values : DataArray of the whole run, dims time and another; read slice by slice.
+        transform : of a slice (minute, cell), before the mean.
         """
         values = values.transpose("time", ...)
-        total: np.ndarray | None = None
-        number = np.zeros(self.count)
-        for rows in _slices(values.sizes["time"]):
-            part = np.asarray(values[rows].values)
-            if total is None:
-                total = np.zeros((self.count, *part.shape[1:]), np.result_type(part.dtype, np.float32))
+        total: Any = None
+        number = np.zeros((self.count, 1), np.float32)
+        for rows in _slices(len(self.column)):
+            part = values.isel(time=slice(self.first + rows.start, self.first + rows.stop)).values
             valid = ~np.isnan(part).any(axis=1)
             part = np.where(valid[:, None], part, 0)
-            columns, first = np.unique(self.column[rows], return_index=True)
-            total[columns] += np.add.reduceat(part, first, axis=0)
-            number[columns] += np.add.reduceat(valid, first, dtype=float)
-        if total is None:
-            return np.full((self.count, 1), np.nan)
-        total[number == 0] = np.nan
-        return total / np.maximum(number, 1.0).astype(np.float32)[:, None]
+            part = part if transform is None else transform(part) * valid[:, None]
+            if total is None:
+                total = np.zeros((self.count, part.shape[1]), part.dtype)
+            columns, begins = np.unique(self.column[rows], return_index=True)
+            total[columns] += np.add.reduceat(part, begins, axis=0)
+            number[columns, 0] += np.add.reduceat(valid, begins, dtype=np.float32)
+        return np.where(number > 0, total / np.maximum(number, 1.0), np.nan)
 
     def strongest(self, weight: np.ndarray) -> np.ndarray:
-        """The minute of greatest weight in each column, −1 where no minute has a weight."""
+        """The run's minute of greatest `weight` (one of each minute of the run) in each column, −1 without any."""
+        part = weight[self.first : self.first + len(self.column)]
+        order = np.argsort(np.nan_to_num(part, nan=-np.inf), kind="stable")
+        order = order[~np.isnan(part[order])]
         chosen = np.full(self.count, -1)
-        order = np.argsort(np.where(np.isnan(weight), -np.inf, weight), kind="stable")
-        order = order[~np.isnan(weight[order])]
-        chosen[self.column[order]] = order
+        chosen[self.column[order]] = order + self.first
         return chosen
 
 
-def range_marginal(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
-    """Log-likelihood ratio against range, range rate marginalised, (column, range); NaN without data.
-
-    A column shows its minute of greatest weight; only these are read, a few at a time.
-    """
-    llr = maps["range_llr"]
-    out = np.full((columns.count, llr.sizes["range"]), np.nan, np.float32)
-    chosen = columns.strongest(weight)
-    shown = np.flatnonzero(chosen >= 0)
-    at_once = max(1, _CELLS // max(llr.sizes["range"] * llr.sizes["range_rate"], 1))
-    for first in range(0, len(shown), at_once):
-        part = shown[first : first + at_once]
-        rows = chosen[part]
-        wanted = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] + 1 == len(rows) else rows
-        block = llr.isel(time=wanted).transpose("time", "range", "range_rate").values
-        out[part] = range_rate_marginal(block.astype(np.float32, copy=False))
-    return out
-
-
 def azimuth_columns(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
-    """Azimuth log-likelihood ratios (column, azimuth) of each column's minute of greatest weight."""
+    """Log-likelihood ratios (column, azimuth), of each column's minute of greatest weight; NaN without data."""
     llr = maps["azimuth_llr"].transpose("time", "azimuth")
     chosen = columns.strongest(weight)
+    shown = chosen >= 0
     out = np.full((columns.count, llr.sizes["azimuth"]), np.nan, np.float32)
-    shown = np.flatnonzero(chosen >= 0)
-    if len(shown):
+    if shown.any():
         out[shown] = llr.isel(time=chosen[shown]).values
     return out
 
 
+def range_columns(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
+    """Log-likelihood ratios (column, range), range rate marginalised; NaN without data.
+
+    Only each column's minute of greatest weight is read, a few columns at a time.
+    """
+    llr, scale = _packed(maps["range_llr"].transpose("time", "range", "range_rate"))
+    chosen = columns.strongest(weight)
+    shown = np.flatnonzero(chosen >= 0)
+    out = np.full((columns.count, llr.sizes["range"]), np.nan, np.float32)
+    at_once = max(1, _CELLS_AT_ONCE // (llr.sizes["range"] * llr.sizes["range_rate"]))
+    for begin in range(0, len(shown), at_once):
+        part = shown[begin : begin + at_once]
+        rows = chosen[part]
+        together = rows[-1] - rows[0] + 1 == len(rows)
+        block = llr.isel(time=slice(rows[0], rows[-1] + 1) if together else rows).values
+        missing = block[:, 0, 0] == llr.attrs["_FillValue"] if scale else np.zeros(len(block), bool)
+        block = block.astype(np.float32, copy=False)
+        out[part] = range_rate_marginal(block * np.float32(scale) if scale else block)
+        out[part[missing]] = np.nan
+    return out
+
+
+def _packed(llr: xr.DataArray) -> tuple[xr.DataArray, float]:
+    """The map as the integers on disk and their resolution, five times faster to read; 0.0 where it is not there."""
+    source, scale = llr.encoding.get("source"), llr.encoding.get("scale_factor")
+    if not source or not scale:
+        return llr, 0.0
+    raw = xr.open_dataset(source, engine="h5netcdf", mask_and_scale=False)["range_llr"]
+    return (raw, float(scale)) if raw.sizes == llr.sizes else (llr, 0.0)
+
+
 def _slices(count: int) -> Iterator[slice]:
-    for first in range(0, count, _SLICE):
-        yield slice(first, first + _SLICE)
+    for begin in range(0, count, _ROWS_AT_ONCE):
+        yield slice(begin, min(begin + _ROWS_AT_ONCE, count))

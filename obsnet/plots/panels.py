@@ -1,170 +1,155 @@
-"""The panels that pictures are made of: representations, likelihood maps, and what was found drawn over them."""
+"""The panels that pictures are made of: representations and likelihood maps against time."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
+from matplotlib.image import AxesImage
+from scipy.signal import hilbert
 
-from obsnet.ais import ReferenceTrack
-from obsnet.layout import to_posix
+from obsnet.ocean.rays import tdoa
 from obsnet.plots import style
-from obsnet.plots.columns import Columns, azimuth_columns, range_marginal
+from obsnet.plots.columns import Columns, azimuth_columns, range_columns
 from obsnet.run import Run
-from obsnet.trackers.track import Track
 
-Delay = Callable[[np.ndarray], np.ndarray]
 HANN_NOISE_BINS = 1.5
-"""Equivalent noise bandwidth of a Hann window in bins of 1 / its length."""
+"""Equivalent noise bandwidth of a Hann window, in bins of 1 / its length."""
+NO_AZIMUTH = "no two horizontals: no azimuth"
+NO_RANGE = "no hydrophone: no range"
+DENSITIES = {"Pa²": (120.0, "dB re 1 µPa²/Hz"), "(m/s)²": (180.0, "dB re 1 (nm/s)²/Hz")}
 
 
-def image(
-    ax: Axes, values: np.ndarray, columns: Columns, axis: np.ndarray, cmap: str, low: float, high: float
-) -> Any:
-    """Values (column, cell) against time and a regular axis."""
-    half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
-    extent = (style.days(columns.start), style.days(columns.end), axis[0] - half, axis[-1] + half)
+def spectrogram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
+    """Power spectral density of the pressure, or of the ground's motion without a hydrophone."""
+    power = run.features.get("power")
+    if power is None:
+        return without(ax, "frequency [Hz]", "no spectrogram")
+    bandwidth = HANN_NOISE_BINS / run.config.spectra.window_s
+    # The spectra give a tone its amplitude; its mean square is half the amplitude's.
+    density = columns.mean(power) / (2.0 * bandwidth)
+    offset, unit = DENSITIES.get(power.attrs.get("units", ""), (0.0, "dB"))
+    level = 10.0 * np.log10(np.maximum(density, np.finfo(np.float32).tiny)) + offset
+    frequency = power["spectrogram_frequency"].values
+    low, high = np.percentile(_finite(level[:, frequency >= 4.0]), [2, 99.7])
+    picture = image(ax, level, columns, frequency, style.SEQUENTIAL, low, high)
+    style.y_axis(ax, "frequency [Hz]", frequency[0], frequency[-1])
+    if bar:
+        style.bar(ax, picture, unit)
+
+
+def azigram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
+    """Azimuth of the sound in each cell of time and frequency, in cyclic colours."""
+    phasor = run.features.get("azigram")
+    if phasor is None:
+        return without(ax, "frequency [Hz]", NO_AZIMUTH)
+    azimuth = np.rad2deg(np.angle(columns.mean(phasor))) % 360.0
+    frequency = phasor["frequency"].values
+    picture = image(ax, azimuth, columns, frequency, style.CYCLIC, 0.0, 360.0)
+    style.y_axis(ax, "frequency [Hz]", frequency[0], frequency[-1])
+    if bar:
+        style.bar(ax, picture, "azimuth")
+
+
+def cepstrogram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
+    """Envelope of the cepstrum, up to the longest delay between the first two paths."""
+    cepstra = run.features.get("cepstrogram")
+    if cepstra is None:
+        return without(ax, "quefrency [s]", NO_RANGE)
+    part = cepstra.sel(quefrency=slice(0.0, longest_quefrency(run) + 0.5))
+    quefrency = part["quefrency"].values
+    level = np.sqrt(columns.mean(part, squared_envelope))
+    low, high = np.percentile(_finite(level[:, quefrency > 0.5]), [20, 99.8])
+    picture = image(ax, level, columns, quefrency, style.SEQUENTIAL, low, high)
+    style.y_axis(ax, "quefrency [s]", 0.0, longest_quefrency(run))
+    if bar:
+        style.bar(ax, picture, "cepstrum")
+
+
+def azimuth_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
+    """Log-likelihood ratio of a ship at each azimuth."""
+    style.azimuth_axis(ax)
+    if "azimuth_llr" not in run.maps:
+        return style.say(ax, NO_AZIMUTH)
+    values = azimuth_columns(run.maps, columns, run.detections["azimuth_llr"].to_numpy(float))
+    picture = image(ax, values, columns, run.maps["azimuth"].values, style.SEQUENTIAL, *_llr_limits(values))
+    style.azimuth_axis(ax)
+    if bar:
+        style.bar(ax, picture, "log-likelihood ratio")
+
+
+def range_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
+    """Log-likelihood ratio of a ship at each range, range rate marginalised."""
+    if "range_llr" not in run.maps:
+        return without(ax, "range [km]", NO_RANGE)
+    values = range_columns(run.maps, columns, run.detections["range_llr"].to_numpy(float))
+    range_km = run.maps["range"].values / 1e3
+    picture = image(ax, values, columns, range_km, style.SEQUENTIAL, *_llr_limits(values))
+    style.y_axis(ax, "range [km]", 0.0, range_km[-1])
+    if bar:
+        style.bar(ax, picture, "log-likelihood ratio")
+
+
+def against_range(ax: Axes, run: Run, envelope: xr.DataArray, label: str) -> None:
+    """An envelope with dims (range, quefrency) in km and s."""
+    range_km, quefrency = envelope["range"].values / 1e3, envelope["quefrency"].values
+    values = envelope.values
+    low, high = np.percentile(_finite(values[:, quefrency > 0.5]), [0, 99.8])
+    extent = (range_km[0], range_km[-1], quefrency[0], quefrency[-1])
     norm = Normalize(low, high if high > low else low + 1.0)
-    return ax.imshow(
+    picture = ax.imshow(
         values.T,
         origin="lower",
         aspect="auto",
         extent=extent,
-        cmap=style.colormap(cmap),
+        cmap=style.SEQUENTIAL,
         norm=norm,
         interpolation="nearest",
     )
+    style.y_axis(ax, "quefrency [s]", 0.0, longest_quefrency(run))
+    style.bar(ax, picture, label)
 
 
-def spectrogram(ax: Axes, features: xr.Dataset, columns: Columns, window_s: float) -> Any:
-    """Power spectral density [dB] of the pressure, or of the ground's motion without a hydrophone."""
-    if "power" not in features:
-        return style.say(ax, "no spectrogram")
-    power = features["power"]
-    density = columns.mean(power) * (window_s / HANN_NOISE_BINS / 2.0)
-    level, unit = 10.0 * np.log10(np.maximum(density, 1e-30)), "dB"
-    if power.attrs.get("units") == "Pa²":
-        level, unit = level + 120.0, "dB re 1 µPa²/Hz"
-    elif power.attrs.get("units") == "m²/s²":
-        level, unit = level + 180.0, "dB re 1 nm²/s²/Hz"
-    frequency = features["spectrogram_frequency"].values
-    shown = _finite(level[:, frequency >= 4.0])
-    picture = image(ax, level, columns, frequency, style.LEVEL, *np.percentile(shown, [2, 99.7]))
-    ax.set_ylim(frequency[0], frequency[-1])
-    ax.set_ylabel("frequency [Hz]")
-    return picture, unit
+def image(
+    ax: Axes, values: np.ndarray, columns: Columns, axis: np.ndarray, cmap: str, low: float, high: float
+) -> AxesImage:
+    """Values (column, cell) against time and a regular axis; NaN stays white."""
+    half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
+    extent = (style.days(columns.start), style.days(columns.end), axis[0] - half, axis[-1] + half)
+    norm = Normalize(low, high if high > low else low + 1.0)
+    return ax.imshow(
+        values.T, origin="lower", aspect="auto", extent=extent, cmap=cmap, norm=norm, interpolation="nearest"
+    )  # fmt: skip
 
 
-def azigram(ax: Axes, features: xr.Dataset, columns: Columns) -> Any:
-    """Azimuth of the sound in each time and frequency cell, in cyclic colours."""
-    if "azigram" not in features:
-        return style.say(ax, "no two horizontals: no azimuth")
-    direction = columns.mean(features["azigram"])
-    azimuth = np.where(np.isnan(direction), np.nan, np.rad2deg(np.angle(direction)) % 360.0)
-    picture = image(ax, azimuth, columns, features["frequency"].values, style.AZIMUTH, 0.0, 360.0)
-    ax.set_ylabel("frequency [Hz]")
-    return picture, "azimuth [°]"
+def squared_envelope(cepstra: np.ndarray) -> np.ndarray:
+    """Squared modulus of the analytic signal along quefrency, of cepstra (minute, quefrency)."""
+    analytic = hilbert(cepstra, axis=1)
+    return (analytic.real**2 + analytic.imag**2).astype(np.float32)
 
 
-def cepstrogram(ax: Axes, features: xr.Dataset, columns: Columns, longest_s: float) -> Any:
-    """Cepstrum against time, up to a quefrency of `longest_s`."""
-    if "cepstrogram" not in features:
-        return style.say(ax, "no hydrophone: no cepstrum")
-    part = features["cepstrogram"].sel(quefrency=slice(0.0, longest_s))
-    values = np.abs(columns.mean(part))
-    quefrency = part["quefrency"].values
-    high = np.percentile(_finite(values[:, quefrency > 0.5]), 99.7)
-    picture = image(ax, values, columns, quefrency, style.CEPSTRUM, 0.0, float(high))
-    ax.set_ylabel("quefrency [s]")
-    return picture, "|cepstrum|"
+def longest_quefrency(run: Run) -> float:
+    """Quefrency [s] up to which there is something to see: the delay between paths 1 and 3, and a little."""
+    if not {1, 3} <= set(run.table["path"].values.tolist()):
+        return 7.0
+    delay = tdoa(run.table, "1-3").values
+    return float(np.clip(1.08 * np.nanmax(delay, initial=0.0), 1.0, 10.0))
 
 
-def azimuth_map(ax: Axes, run: Run, columns: Columns) -> Any:
-    """Log-likelihood ratio of a ship at each azimuth."""
-    if "azimuth_llr" not in run.maps:
-        style.azimuth_axis(ax)
-        return style.say(ax, "no two horizontals: no azimuth")
-    weight = run.detections["azimuth_llr"].to_numpy(float)
-    values = azimuth_columns(run.maps, columns, weight)
-    high = np.clip(np.percentile(_finite(values), 99.9), 10.0, 60.0)
-    picture = image(ax, values, columns, run.maps["azimuth"].values, style.LLR, -high, high)
-    style.azimuth_axis(ax)
-    return picture, "log-likelihood ratio"
+def _llr_limits(values: np.ndarray) -> tuple[float, float]:
+    """Symmetric about 0, where the map says nothing."""
+    high = float(np.clip(np.percentile(_finite(values), 99.8), 10.0, 60.0))
+    return -high, high
 
 
-def range_map(ax: Axes, run: Run, columns: Columns) -> Any:
-    """Log-likelihood ratio of a ship at each range [km], range rate marginalised."""
-    if "range_llr" not in run.maps:
-        ax.set_ylabel("range [km]")
-        return style.say(ax, "no hydrophone: no range")
-    weight = run.detections["range_llr"].to_numpy(float)
-    values = range_marginal(run.maps, columns, weight)
-    high = np.clip(np.percentile(_finite(values), 99.9), 10.0, 60.0)
-    picture = image(ax, values, columns, run.maps["range"].values / 1e3, style.LLR, -high, high)
-    ax.set_ylim(0.0, run.maps["range"].values[-1] / 1e3)
-    ax.set_ylabel("range [km]")
-    return picture, "log-likelihood ratio"
-
-
-def heard(track: Track, delay: Delay, step_s: float = 120.0) -> tuple[np.ndarray, ...]:
-    """Times [s since 1970], azimuth [deg], range [m] and range rate [m/s] of a track as the station hears it.
-
-    What is heard at t left the ship at e, e + delay(range(e)) = t.
-    """
-    time = np.linspace(track.start, track.end, max(int((track.end - track.start) / step_s), 1) + 1)
-    emitted = time
-    for _ in range(6):
-        emitted = time - np.asarray(delay(track.motion.observables(emitted)[1]), float)
-    azimuth, distance, rate = track.motion.observables(emitted)
-    if not np.isfinite(track.std[2]):
-        azimuth = np.full_like(azimuth, np.nan)
-    return time, azimuth, distance, rate
-
-
-def reference_heard(reference: ReferenceTrack, delay: Delay, start: float, end: float) -> tuple[np.ndarray, ...]:
-    """As `heard`, of an AIS track within `start` … `end`; empty where it is outside."""
-    first, last = max(start, reference.starttime), min(end, reference.endtime + 120.0)
-    time = np.linspace(first, last, 400) if last > first else np.empty(0)
-    if not len(time):
-        return (time,) * 4
-    return time, *reference.heard(time, delay)
-
-
-def without_jumps(time: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An azimuth curve cut where it passes north, so that no line crosses the panel."""
-    cut = np.flatnonzero(np.abs(np.diff(azimuth)) > 180.0) + 1
-    return np.insert(time, cut, np.nan), np.insert(azimuth, cut, np.nan)
+def without(ax: Axes, label: str, text: str) -> None:
+    """A panel that has nothing to show, and why."""
+    ax.set_yticks([])
+    ax.set_ylabel(label, fontsize=9)
+    style.say(ax, text)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
     found = values[np.isfinite(values)]
     return found if found.size else np.array([0.0, 1.0])
-
-
-def overlay(ax: Axes, run: Run, reference: list[ReferenceTrack], kind: str, start: float, end: float) -> None:
-    """Detections, tracks and AIS as heard, on a map of `kind` azimuth or range."""
-    found = run.detections
-    column, scale = ("azimuth_deg", 1.0) if kind == "azimuth" else ("range_m", 1e-3)
-    values = found[column].to_numpy(float) * scale
-    shown = np.isfinite(values)
-    seconds = to_posix(found["time"].to_numpy()[shown])
-    ax.plot(style.days(seconds), values[shown], "o", ms=2.2, mfc="white", mec="black", mew=0.35, ls="")
-    index = 0 if kind == "azimuth" else 1
-    for ship in reference:
-        time, *curves = reference_heard(ship, run.delay, start, end)
-        _curve(ax, kind, time, curves[index] * scale if len(time) else time, "white", "black", (0, (4, 3)))
-    for number, track in enumerate(run.tracks):
-        time, *curves = heard(track, run.delay)
-        colour = style.TRACK_COLOURS[number % len(style.TRACK_COLOURS)]
-        _curve(ax, kind, time, curves[index] * scale, "white", colour, "-")
-
-
-def _curve(ax: Axes, kind: str, time, values, under: str, colour: str, line: Any) -> None:
-    if kind == "azimuth":
-        time, values = without_jumps(time, values)
-    ax.plot(style.days(time), values, color=under, lw=2.6, alpha=0.8)
-    ax.plot(style.days(time), values, color=colour, lw=1.4, ls=line)

@@ -6,44 +6,78 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from obsnet.ais import ReferenceTrack
+from obsnet.layout import to_posix
 from obsnet.plots import style
+from obsnet.plots.overlay import NUMBERED, draw_reference
 from obsnet.run import Run
 from obsnet.trackers.track import Track
 
 NINETY_PERCENT = 4.605
 """90 % quantile of χ² with two degrees of freedom."""
+_TURN = np.linspace(0.0, 2.0 * np.pi, 121)
 
 
-def plan_view(ax: Axes, run: Run, reference: list[ReferenceTrack], start: float, end: float) -> None:
-    """Draw a run around its station, in km east and north."""
-    reach = reach_km(run.tracks, reference, start, end)
+def plan_view(
+    ax: Axes, run: Run, reference: list[ReferenceTrack], start: float, end: float, only: int | None = None
+) -> None:
+    """Draw what a run found between `start` and `end` around its station, in km east and north.
+
+    Parameters
+    ----------
+    only : number (from 0) of the one track to draw.
+    """
+    numbered = [(n, track) for n, track in enumerate(run.tracks) if only is None or n == only]
+    reach = reach_km([track for _, track in numbered], reference, start, end)
     ax.set_aspect("equal")
     ax.set_xlim(-reach, reach)
-    ax.set_ylim(-reach, reach)
-    ax.set_xlabel("east of the station [km]")
-    ax.set_ylabel("north of the station [km]")
+    ticks = style.nice_ticks(-reach, reach, 5)
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=8)
+    ax.set_xlabel("east [km]", fontsize=9)
+    style.y_axis(ax, "north [km]", -reach, reach)
     _circles(ax, reach)
-    _detections(ax, run)
+    _detections(ax, run, start, end)
+    for number, track in numbered:
+        _track(ax, track, number, label=1 < len(numbered) <= NUMBERED)
     for ship in reference:
         _reference(ax, ship, start, end)
-    for number, track in enumerate(run.tracks):
-        _track(ax, track, number)
     ax.plot(0, 0, "*", ms=13, mfc=style.YELLOW, mec="black", mew=0.8, zorder=6)
 
 
+def close_up(ax: Axes, track: Track, number: int, reference: list[ReferenceTrack]) -> None:
+    """The closest approach of a track at the scale of its uncertainty, with the AIS tracks that pass there."""
+    outline = np.stack(ellipse(track)) / 1e3
+    centre = outline[:, :-1].mean(axis=1)
+    reach = 2.2 * float(np.abs(outline - centre[:, None]).max()) + 0.05
+    ax.set_aspect("equal")
+    ax.set_xlim(centre[0] - reach, centre[0] + reach)
+    ticks = style.nice_ticks(centre[0] - reach, centre[0] + reach, 3)
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=7)
+    style.y_axis(ax, "", centre[1] - reach, centre[1] + reach, most=3)
+    motion = track.motion
+    _draw_track(ax, track, number, motion.cpa_time + 2e3 * reach / motion.speed_mps * np.array([-1.0, 1.0]))
+    ax.plot(*centre, "o", ms=4, mfc="white", mec="black", zorder=6)
+    for ship in reference:
+        _reference(ax, ship, motion.cpa_time - 7200.0, motion.cpa_time + 7200.0)
+        east, north, _ = ship.at(motion.cpa_time)
+        ax.plot(east / 1e3, north / 1e3, "x", ms=5, color="black", mew=1.2, zorder=6)
+    ax.set_title(f"{number + 1}: closest approach [km]", fontsize=8, pad=3)
+
+
 def reach_km(tracks: list[Track], reference: list[ReferenceTrack], start: float, end: float) -> float:
-    """Half-width of the view: what holds all tracks, else all AIS, at most 100 km."""
-    farthest = [np.hypot(*track.positions(300.0)[1:]).max() for track in tracks]
+    """Half-width of the view: what holds all tracks, or all AIS without any; 5 to 100 km."""
+    farthest = [float(np.hypot(*track.positions(300.0)[1:]).max()) for track in tracks]
     if not farthest:
-        farthest = [np.nanmax(np.hypot(*ship.at(np.linspace(start, end, 50))[:2]), initial=0.0) for ship in reference]
+        time = np.linspace(start, end, 200)
+        away = [np.hypot(*ship.at(time)[:2]) for ship in reference]
+        farthest = [float(np.nanmax(distance)) for distance in away if np.isfinite(distance).any()]
     return float(np.clip(1.08 * max(farthest, default=46e3) / 1e3, 5.0, 100.0))
 
 
-def ellipse(track: Track, count: int = 73) -> tuple[np.ndarray, np.ndarray]:
+def ellipse(track: Track) -> tuple[np.ndarray, np.ndarray]:
     """East and north [m] of the 90 % ellipse of the ship's position at its estimated CPA time.
 
-    A later CPA puts the ship back along its course by speed times the delay; a turned course carries it along by range
-    times the turn.
+    Passing later by δt puts the ship back along its course by speed δt; turning the course by δ carries it back along it
+    by range δ.
     """
     motion = track.motion
     course = np.deg2rad(motion.course_deg)
@@ -54,48 +88,64 @@ def ellipse(track: Track, count: int = 73) -> tuple[np.ndarray, np.ndarray]:
     slope[:, 1] = across
     slope[:, 2] = -np.deg2rad(1.0) * motion.cpa_range_m * along
     values, vectors = np.linalg.eigh(slope @ track.covariance @ slope.T)
-    turn = np.linspace(0.0, 2.0 * np.pi, count)
     axes = vectors * np.sqrt(NINETY_PERCENT * np.maximum(values, 0.0))
     east, north = motion.position(np.asarray(motion.cpa_time))
-    around = axes @ np.stack([np.cos(turn), np.sin(turn)])
+    around = axes @ np.stack([np.cos(_TURN), np.sin(_TURN)])
     return east + around[0], north + around[1]
 
 
 def _circles(ax: Axes, reach: float) -> None:
     spacing = next(step for step in (1, 2, 5, 10, 20, 25, 50) if reach / step < 4.5)
-    turn = np.linspace(0.0, 2.0 * np.pi, 121)
-    for radius in np.arange(spacing, reach, spacing):
-        ax.plot(radius * np.cos(turn), radius * np.sin(turn), color="#BBBBBB", lw=0.7, zorder=0)
-        ax.text(0, -radius, f"{radius:g} km", fontsize=7, color="#666666", ha="center", va="top", zorder=0)
+    frame = {"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none"}
+    for radius in np.arange(spacing, 1.4 * reach, spacing):
+        ax.plot(radius * np.cos(_TURN), radius * np.sin(_TURN), color="#BBBBBB", lw=0.7, zorder=0)
+        if radius < 0.95 * reach:
+            ax.text(0, -radius, f"{radius:g} km", fontsize=7, color="#555555", ha="center", va="center", bbox=frame,
+                    zorder=0.5)  # fmt: skip
 
 
-def _detections(ax: Axes, run: Run) -> None:
-    found = run.detections
-    both = found["azimuth_deg"].notna() & found["range_m"].notna()
-    azimuth = np.deg2rad(found["azimuth_deg"].to_numpy(float)[both])
-    distance = found["range_m"].to_numpy(float)[both] / 1e3
-    ax.plot(distance * np.sin(azimuth), distance * np.cos(azimuth), ".", ms=2, color="#888888", zorder=1)
+def _detections(ax: Axes, run: Run, start: float, end: float) -> None:
+    found, seconds = run.detections, to_posix(run.detections["time"].to_numpy())
+    azimuth, distance = (
+        np.deg2rad(found["azimuth_deg"].to_numpy(float)),
+        found["range_m"].to_numpy(float) / 1e3,
+    )
+    both = np.isfinite(azimuth * distance) & (seconds >= start) & (seconds <= end)
+    east, north = (distance * np.sin(azimuth))[both], (distance * np.cos(azimuth))[both]
+    ax.plot(east, north, ".", ms=2.2, color="#888888", zorder=1)
 
 
 def _reference(ax: Axes, ship: ReferenceTrack, start: float, end: float) -> None:
-    time = np.linspace(max(start, ship.time[0]), min(end, ship.time[-1]), 200)
-    if time[-1] <= time[0]:
-        return
-    east, north, _ = ship.at(time)
-    ax.plot(east / 1e3, north / 1e3, color="black", lw=1.3, ls=(0, (4, 3)), zorder=4)
+    first, last = max(start, ship.time[0]), min(end, ship.time[-1])
+    if first < last:
+        east, north, _ = ship.at(np.linspace(first, last, 200))
+        draw_reference(ax, east / 1e3, north / 1e3)
 
 
-def _track(ax: Axes, track: Track, number: int) -> None:
-    colour = style.TRACK_COLOURS[number % len(style.TRACK_COLOURS)]
+def _track(ax: Axes, track: Track, number: int, label: bool) -> None:
+    look = style.track_style(number)
     if not np.isfinite(track.std[2]):
-        turn = np.linspace(0.0, 2.0 * np.pi, 121)
         radius = abs(track.motion.cpa_range_m) / 1e3
-        ax.plot(radius * np.cos(turn), radius * np.sin(turn), color=colour, lw=1.6, ls=":", zorder=3)
+        ax.plot(radius * np.cos(_TURN), radius * np.sin(_TURN), color=look["color"], lw=1.6, ls=":", zorder=3)
         return
-    _, east, north = track.positions(120.0)
-    ax.plot(east / 1e3, north / 1e3, color=colour, lw=1.8, zorder=3)
-    step = max(len(east) // 12, 1)
-    ax.annotate("", (east[-1] / 1e3, north[-1] / 1e3), (east[-1 - step] / 1e3, north[-1 - step] / 1e3),
-                arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8}, annotation_clip=True)  # fmt: skip
-    around = ellipse(track)
-    ax.fill(around[0] / 1e3, around[1] / 1e3, fc=colour, ec="black", lw=0.8, alpha=0.6, zorder=5)
+    time = np.linspace(track.start, track.end, 60)
+    east, north = _draw_track(ax, track, number, time)
+    ax.annotate("", (east[-1], north[-1]), (east[-6], north[-6]), zorder=3.5,
+                arrowprops={"arrowstyle": "-|>", "color": look["color"], "lw": 1.8})  # fmt: skip
+    if label:
+        frame = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": look["color"], "lw": 1.0}
+        ax.text(east[-8], north[-8], str(number + 1), fontsize=7, ha="center", va="center", bbox=frame, clip_on=True,
+                zorder=7)  # fmt: skip
+
+
+def _draw_track(ax: Axes, track: Track, number: int, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Its course over `time` and its 90 % ellipse; east and north [km] of the course."""
+    look = style.track_style(number)
+    east, north = (along / 1e3 for along in track.motion.position(time))
+    ax.plot(east, north, lw=1.8, zorder=3, **look)
+    if np.isfinite(track.std).all():
+        outline = ellipse(track)
+        ax.fill(
+            outline[0] / 1e3, outline[1] / 1e3, fc=look["color"], ec="black", lw=0.8, alpha=0.55, zorder=5.5
+        )
+    return east, north

@@ -1,7 +1,7 @@
 """Colours, axes of time and files that all pictures share.
 
-Sequential maps grow evenly in lightness (readable in grey), the map of azimuth is cyclic, and categories take the colours of
-Okabe and Ito with a marker or a line style of their own.
+Sequential maps grow evenly in lightness (readable in grey), the map of azimuth is cyclic, and categories take the
+colours of Okabe and Ito, each with a marker or a line style of its own. Missing data are white.
 """
 
 from __future__ import annotations
@@ -11,29 +11,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from obsnet.errors import OutputError
+from obsnet.layout import iso
 
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+ORANGE, SKY, GREEN = "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
-TRACK_COLOURS = (VERMILLION, SKY, PURPLE, ORANGE, GREEN, BLUE)
-LLR, LEVEL, CEPSTRUM, RANGE_RATE = "cividis", "cividis", "Greys", "PuOr_r"
-AZIMUTH = "twilight"
-NO_DATA = "#B0B0B0"
+SEQUENTIAL, CYCLIC, DIVERGING = "cividis", "twilight", "PuOr_r"
+REFERENCE_DASHES = (0, (3.5, 2.5))
 DPI = 100
 _DAY = 86400.0
+_STEPS = (60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200)
+_STEPS_DAYS = (1, 2, 5, 10, 30, 60, 180, 365)
 
 
-def colormap(name: str) -> Any:
-    """A colour map whose missing values are grey."""
-    found = colormaps[name].copy()
-    found.set_bad(NO_DATA)
-    return found
+def track_style(number: int) -> dict[str, Any]:
+    """Colour and line style of track `number` (from 0)."""
+    colours = (VERMILLION, SKY, PURPLE, ORANGE, GREEN)
+    dashes = ("-", "-.", ":")
+    return {
+        "color": colours[number % len(colours)],
+        "ls": dashes[number // len(colours) % len(dashes)],
+    }
 
 
 def figure(width: float, height: float) -> Figure:
@@ -43,29 +46,87 @@ def figure(width: float, height: float) -> Figure:
     return made
 
 
+def box(made: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes at a place of the page, in inches from its lower left corner."""
+    page = made.get_size_inches()
+    return made.add_axes((left / page[0], bottom / page[1], width / page[0], height / page[1]))
+
+
 def days(seconds: Any) -> Any:
-    """Times on a matplotlib date axis (days since 1970) of s since 1970."""
+    """Times on the axis of time (days since 1970) of s since 1970."""
     return np.asarray(seconds, float) / _DAY
 
 
-def time_axis(ax: Axes, start: float, end: float, labelled: bool = True) -> None:
-    """UTC ticks over `start` … `end` (s since 1970)."""
-    locator = AutoDateLocator(minticks=3, maxticks=9)
-    ax.xaxis.set_major_locator(locator)
-    ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+def time_axis(ax: Axes, start: float, end: float, labelled: bool = True, most: int = 9) -> None:
+    """UTC ticks, at most `most`, over `start` … `end` (s since 1970); dates under the first and each midnight."""
+    ticks = _time_ticks(start, end, most)
+    labels = []
+    for i, tick in enumerate(ticks):
+        stamp = iso(float(tick))
+        text = "" if _whole_days(ticks) else stamp[11:16]
+        dated = i == 0 or tick % _DAY == 0
+        labels.append(f"{text}\n{stamp[:10]}".strip() if dated else text)
+    if not labelled:
+        labels = [""] * len(ticks)
+    ax.set_xticks(days(ticks), labels, fontsize=8)
     ax.set_xlim(days(start), days(end))
-    ax.tick_params(axis="x", labelbottom=labelled)
     if labelled:
-        ax.set_xlabel("time (UTC)")
-    else:
-        ax.xaxis.get_offset_text().set_visible(False)
+        ax.set_xlabel("time (UTC)", fontsize=9)
 
 
-def azimuth_axis(ax: Axes) -> None:
+def _time_ticks(start: float, end: float, most: int) -> np.ndarray:
+    span = end - start
+    steps = [*_STEPS, *(_DAY * n for n in _STEPS_DAYS)]
+    step = next((s for s in steps if span / s <= most), _DAY * 365 * np.ceil(span / most / _DAY / 365))
+    return step * np.arange(np.ceil(start / step), np.floor(end / step) + 1)
+
+
+def _whole_days(ticks: np.ndarray) -> bool:
+    return bool(len(ticks) > 1 and ((ticks[1] - ticks[0]) % _DAY == 0))
+
+
+def azimuth_axis(ax: Axes, named: bool = True) -> None:
     """Azimuth from 0° to 360°, a tick at each cardinal point."""
     ax.set_ylim(0.0, 360.0)
-    ax.set_yticks([0, 90, 180, 270, 360], ["N 0", "E 90", "S 180", "W 270", "N 360"])
-    ax.set_ylabel("azimuth [°]")
+    ax.set_yticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"], fontsize=8)
+    if named:
+        ax.set_ylabel("azimuth", fontsize=9)
+
+
+def y_axis(ax: Axes, label: str, low: float, high: float, most: int = 6) -> None:
+    """Limits, at most so many ticks, and the name of a vertical axis."""
+    ax.set_ylim(low, high)
+    ax.set_yticks(ticks := nice_ticks(low, high, most), [f"{tick:g}" for tick in ticks], fontsize=8)
+    ax.set_ylabel(label, fontsize=9)
+
+
+def nice_ticks(low: float, high: float, most: int = 6) -> np.ndarray:
+    """Multiples of 1, 2 or 5 times a power of ten within the limits."""
+    decade = 10.0 ** np.floor(np.log10((high - low) / most))
+    step = next(decade * m for m in (1, 2, 5, 10) if (high - low) / (decade * m) <= most)
+    return np.round(step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1), 9) + 0.0
+
+
+def bar(ax: Axes, picture: AxesImage, label: str) -> None:
+    """Colour bar of an image, beside its axes; light, where matplotlib's own is slow."""
+    made = ax.figure
+    place = ax.get_position()
+    width = 0.11 / made.get_size_inches()[0]
+    cax = made.add_axes((place.x1 + 0.6 * width, place.y0, width, place.height))
+    low, high = picture.norm.vmin, picture.norm.vmax
+    shades = np.linspace(low, high, 128)[:, None]
+    cax.imshow(
+        shades, origin="lower", aspect="auto", extent=(0, 1, low, high), cmap=picture.cmap, norm=picture.norm
+    )
+    cax.yaxis.tick_right()
+    cax.yaxis.set_label_position("right")
+    cax.set_xticks([])
+    if label == "azimuth":
+        cax.set_yticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"], fontsize=7.5)
+    else:
+        ticks = nice_ticks(low, high, 5)
+        cax.set_yticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=7.5)
+    cax.set_ylabel(label, fontsize=8)
 
 
 def say(ax: Axes, text: str) -> None:
@@ -74,10 +135,17 @@ def say(ax: Axes, text: str) -> None:
     ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center", color="#404040")
 
 
-def label(ax: Axes, text: str) -> None:
+def name(ax: Axes, text: str) -> None:
     """Name a panel in its upper left corner."""
-    box = {"boxstyle": "square,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    ax.text(0.006, 0.96, text, transform=ax.transAxes, ha="left", va="top", fontsize=8.5, bbox=box, zorder=9)
+    frame = {"boxstyle": "square,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+    ax.annotate(text, (0, 1), (5, -5), xycoords="axes fraction", textcoords="offset points", ha="left", va="top",
+                fontsize=8.5, bbox=frame, zorder=9)  # fmt: skip
+
+
+def span(start: float, end: float) -> str:
+    """A stretch of time, to the minute, the date once where it is the same."""
+    first, last = (iso(float(np.rint(t / 60.0) * 60.0))[:16].replace("T", " ") for t in (start, end))
+    return f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
 
 
 def save(made: Figure, path: str | Path) -> Path:
@@ -91,7 +159,7 @@ def save(made: Figure, path: str | Path) -> Path:
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        made.savefig(partial, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
+        made.savefig(partial, format="png", dpi=DPI, pil_kwargs={"compress_level": 2})
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
