@@ -100,7 +100,7 @@ class TimeWriter:
             )
             variable.attrs.update(values.attrs)
             if packed:
-                variable.attrs.update({"scale_factor": PACKED[name], "add_offset": 0.0})
+                variable.attrs.update({"scale_factor": np.float32(PACKED[name])})
         return file
 
 

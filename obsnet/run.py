@@ -196,10 +196,8 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
     found = segments(run.presence, run.config.segmentation)
     tracks: list[Track] = []
     for segment in found:
-        window = slice(from_posix(segment.start - 1.0), from_posix(segment.end + 1.0))
-        part = run.maps.sel(time=window).load()
         near = [known for known in tracks if known.end > segment.start - 3600.0]
-        new = search(part, segment, delay, run.config.grid_search, threads, near)
+        new = search(run.maps, segment, delay, run.config.grid_search, threads, near)
         if not new and not near and not _range_heard(run, segment):
             new = _by_bearings(run, segment, delay)
         if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:

@@ -201,8 +201,8 @@ def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.n
         values, vectors = scipy.linalg.eigh(matrix, check_finite=False)
         return values[::-1][:size], vectors[:, ::-1][:, :size]
     basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8))
-    for _ in range(12):
-        basis, _ = np.linalg.qr(matrix @ basis)
+    for _ in range(5):
+        basis, _ = np.linalg.qr(matrix @ (matrix @ basis))
     values, turn = scipy.linalg.eigh(basis.T @ matrix @ basis, check_finite=False)
     return values[::-1][:size], (basis @ turn)[:, ::-1][:, :size]
 

@@ -20,7 +20,6 @@ from obsnet.errors import ConfigError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import to_posix
 from obsnet.trackers import search_kernels
-from obsnet.trackers.segmentation import mixture
 from obsnet.trackers.track import Segment, Track
 
 
@@ -265,7 +264,7 @@ class _Finder:
         seen = np.array([True, True, self.sees_course, True])
         mean, cov = best.copy(), np.diag([60.0, 500.0, 3.0, 0.3]) ** 2
         log_evidence = -np.inf
-        for _ in range(6):
+        for _ in range(5):
             points, log_proposal = _student(rng, mean, cov, config.samples, seen)
             inside = self._inside(points)
             log_target = np.where(inside, config.exponent * self._score_points(points, scores), -np.inf)
@@ -380,17 +379,18 @@ class _Finder:
 
 
 def _tiles(maps: xr.Dataset, segment: Segment, config: GridSearchConfig):
-    """Tile times and the maps there; none if the segment holds no tile with data."""
+    """Tile times and the maps there, read from disk no further than that; none if there are fewer than three."""
     times = to_posix(maps["time"].values)
     inside = (times >= segment.start - 1e-6) & (times <= segment.end + 1e-6)
     inside &= np.abs(times / config.tile_s - np.round(times / config.tile_s)) * config.tile_s < 0.5
     chosen = np.flatnonzero(inside)
     if len(chosen) < 3:
         return None
-    part = maps.isel(time=chosen)
-    azimuth_llr = part["azimuth_llr"].values.astype(np.float32) if "azimuth_llr" in maps else None
-    range_llr = part["range_llr"].values.astype(np.float32) if "range_llr" in maps else None
-    return times[chosen], azimuth_llr, range_llr
+    strides = np.diff(chosen)
+    regular = slice(chosen[0], chosen[-1] + 1, strides[0]) if (strides == strides[0]).all() else chosen
+    part = maps.isel(time=regular)
+    llr = [part[name].values.astype(np.float32, copy=False) if name in maps else None for name in ("azimuth_llr", "range_llr")]
+    return times[chosen], *llr
 
 
 def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
@@ -401,8 +401,10 @@ def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mixed(ratio: np.ndarray, top: np.ndarray, probability: float) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        return mixture(np.log(ratio) + top, probability).astype(np.float32)
+    """Log of (1 − Pd) + Pd·ratio·exp(top) (see `segmentation.mixture`); 0 where there is no data."""
+    share = np.float32(probability) * np.exp(np.nan_to_num(top)).astype(np.float32)
+    mixed = np.log(ratio * share + np.float32(1.0 - probability))
+    return np.where(np.isnan(top), np.float32(0.0), mixed)
 
 
 def _polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -> tuple[np.ndarray, float]:
