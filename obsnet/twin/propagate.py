@@ -81,8 +81,11 @@ class _Column:
 class Paths:
     """A propagation table as functions of range; a path has zero pressure where it does not exist."""
 
-    def __init__(self, table: xr.Dataset, sediment: Sediment | None = None) -> None:
-        self.sediment = sediment
+    def __init__(
+        self, table: xr.Dataset, sediment: Sediment | None = None, bottom_loss_db: float = 0.0
+    ) -> None:
+        """`bottom_loss_db` is what each reflection at the sea floor loses beyond the table's coefficient."""
+        self.sediment, self.bottom_loss_db = sediment, bottom_loss_db
         require(table, PROPAGATION)
         table = table.transpose("path", "range", ...)
         self.range_m = table["range"].values.astype(float)
@@ -106,6 +109,7 @@ class Paths:
         ranges = self.range_m[there]
         filled = np.interp(self.range_m, ranges, slowness[there])
         strength = np.where(there, pressure, 0.0).astype(np.complex128)
+        strength *= 10 ** (-self.bottom_loss_db / 20 * ((int(path["path"]) - 1) // 2))
         spline = CubicHermiteSpline(ranges, delay[there], slowness[there])
         return _Column(spline, strength, filled, self._admittance(path, filled))
 

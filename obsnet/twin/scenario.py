@@ -56,6 +56,9 @@ class Scenario:
     tremor : Tremor or None
     sediment : Sediment or None
         A reflector below the sea floor.
+    bottom_loss_db : float
+        What each reflection at the sea floor loses to attenuation and scattering, which a propagation table of ideal
+        half-spaces leaves out.
     faults : Faults
         Gaps, dead or clipped channels.
     ocean : OceanConfig
@@ -73,6 +76,7 @@ class Scenario:
     earthquakes: Earthquakes | None = None
     tremor: Tremor | None = None
     sediment: Sediment | None = None
+    bottom_loss_db: float = 1.0
     faults: Faults = field(default_factory=Faults)
     ocean: OceanConfig = field(default_factory=lambda: OceanConfig(max_range_m=MAX_RANGE_M))
     seed: int = 0
@@ -243,5 +247,6 @@ def _draw_nuisances(generator: np.random.Generator, start: float, hours: float) 
         "earthquakes": earthquakes,
         "tremor": tremor if generator.random() < 0.35 else None,
         "sediment": sediment if generator.random() < 0.6 else None,
+        "bottom_loss_db": float(generator.uniform(0.5, 3.0)),
         "faults": Faults.random(generator, hours),
     }

@@ -150,7 +150,7 @@ def _draw_lines(ship: Ship, generator: np.random.Generator) -> tuple[LineSeries,
     excess = generator.normal(4.0, 5.0, len(harmonics))
     for i, k in enumerate(harmonics):
         strong = (k % ship.blades == 0) or (k % cylinders == 0)
-        excess[i] += generator.uniform(8.0, 22.0) if strong else 0.0
+        excess[i] += generator.uniform(6.0, 20.0) if strong else 0.0
     kept = [(k, e) for k, e in zip(harmonics, excess, strict=True) if e > 4.0]
     auxiliary = float(generator.uniform(5.0, 7.5))
     multiples = tuple(range(1, int(120 / auxiliary)))

@@ -240,7 +240,7 @@ def _after_ais(
 
 def _paths(scenario: Scenario, table: xr.Dataset | None) -> Paths:
     table = propagation_table(scenario.ocean, scenario.recorder.depth_m) if table is None else table
-    return Paths(table, scenario.sediment)
+    return Paths(table, scenario.sediment, scenario.bottom_loss_db)
 
 
 def _counts(

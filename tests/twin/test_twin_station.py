@@ -176,7 +176,8 @@ def test_cepstrum_peaks_at_the_tdoa_with_the_phase_difference(pair, distance):
 def test_received_level_is_source_level_less_transmission_loss():
     still = StraightCourse(START, 10_000.0, 10.0, 0.0)
     ship = Ship(source_level_db=200.0, modulation=0.0, level_spread_db=0.0)
-    simulation = simulate(scenario(passages=(Passage(ship, still),), ambient=None), TABLE)
+    asked = scenario(passages=(Passage(ship, still),), ambient=None, bottom_loss_db=4.0)
+    simulation = simulate(asked, TABLE)
     recorder = Recorder()
     f, psd = welch(counts(simulation, "BDH"), 50.0, nperseg=1024)
     band = (f > 10.0) & (f < 20.0)
@@ -184,7 +185,9 @@ def test_received_level_is_source_level_less_transmission_loss():
     at = TABLE.sel(range=10_000.0, method="nearest")
     sine = np.sqrt(TABLE.attrs["surface_speed_mps"] ** -2.0 - at["slowness"].values ** 2)
     dipole = 2 * np.sin(2 * np.pi * f[band] * ship.source_depth_m * sine[:, None])
-    loss = np.nansum(np.abs(at["pressure"].values[:, None] * dipole) ** 2, axis=0)
+    bounces = (TABLE["path"].values - 1) // 2
+    pressure = at["pressure"].values * 10 ** (-4.0 / 20 * bounces)
+    loss = np.nansum(np.abs(pressure[:, None] * dipole) ** 2, axis=0)
     expected = 1e-12 * 10 ** (ship.spectrum_level_db(f[band]) / 10) * loss
     assert 10 * np.log10(measured.mean() / expected.mean()) == pytest.approx(0.0, abs=0.5)
 
