@@ -26,9 +26,20 @@ rest."""
 class ObservationModel(Protocol):
     """How states move, what they measure, and where a new one may be."""
 
-    channels: int
-    dimensions: int
-    noise: np.ndarray
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        ...
+
+    @property
+    def dimensions(self) -> int:
+        """Angles in the state, which holds as many rates."""
+        ...
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Covariance (channel, channel) of measurements."""
+        ...
 
     def dynamics(self, interval_s: float, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Transition (2d, 2d) and process noise (..., 2d, 2d) from states with dims (..., 2d)."""
