@@ -46,8 +46,10 @@ class TurningCourse:
     radius_m: float = 1500.0
 
     def __post_init__(self) -> None:
-        if self.radius_m <= 0:
-            raise ConfigError(f"the turning circle's radius must be positive, found {self.radius_m}")
+        if not (self.radius_m > 0 and self.before.speed_mps > 0):
+            raise ConfigError(
+                f"a turn needs radius and speed > 0, found {self.radius_m} m, {self.before.speed_mps} m/s"
+            )
 
     def position(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """East and north [m] at `time` [s since 1970]."""
@@ -64,7 +66,7 @@ class TurningCourse:
         return east, north
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WaypointCourse:
     """Through given positions, at constant velocity between them, or smoothly (monotone cubics); straight on
     beyond them.

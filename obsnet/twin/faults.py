@@ -68,9 +68,9 @@ class Faults:
     def pieces(
         self, part: str, first: int, counts: np.ndarray, sampling_rate: float, start: float
     ) -> Iterator[tuple[int, np.ndarray]]:
-        """Contiguous int32 pieces of a component's counts, with their offset in samples."""
+        """Contiguous pieces of a component's int32 counts, with their offset in samples."""
         limit = self.clip_counts // 100 if part in self.clipped else self.clip_counts
-        whole = np.clip(np.rint(counts), -limit - 1, limit).astype(np.int32)
+        whole = np.clip(counts, -limit - 1, limit)
         if part in self.dead:
             whole[:] = 0
         keep = np.ones(whole.size, bool)

@@ -35,7 +35,8 @@ def gaussian_noise(
 
     Blocks of 500 s are drawn in the frequency domain, each from its own seed, lowest frequencies first, and
     joined every 450 s by cross-fades whose squares sum to one: the variance is stationary, any part can be
-    made alone, and two sampling rates give the same waveform below the lower Nyquist frequency.
+    made alone, and two sampling rates of which 450 s are whole samples give the same waveform below the lower
+    Nyquist frequency.
 
     Parameters
     ----------

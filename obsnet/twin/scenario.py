@@ -57,8 +57,8 @@ class Scenario:
     sediment : Sediment or None
         A reflector below the sea floor.
     bottom_loss_db : float
-        What each reflection at the sea floor loses to attenuation and scattering, which a propagation table of ideal
-        half-spaces leaves out.
+        What each reflection at the sea floor loses to attenuation and scattering, which a propagation table
+        of ideal half-spaces leaves out.
     faults : Faults
         Gaps, dead or clipped channels.
     ocean : OceanConfig

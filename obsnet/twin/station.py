@@ -259,9 +259,13 @@ def _counts(
         _fill(motion, block * size - context, scenario, emissions, paths)
         counts = scenario.recorder.record(motion, context, size)
         low, high = max(first - block * size, 0), min(last - block * size, size)
-        yield block * size + low, {part: values[low:high] for part, values in counts.items()}
+        yield block * size + low, {part: _whole_counts(values[low:high]) for part, values in counts.items()}
         if progress is not None:
             progress(done + 1, len(blocks))
+
+
+def _whole_counts(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), -(2.0**31), 2.0**31 - 1).astype(np.int32)
 
 
 def _fill(motion: Field, first: int, scenario: Scenario, emissions: list[Emission], paths: Paths) -> None:

@@ -70,5 +70,5 @@ def test_bad_waypoints_are_refused():
         WaypointCourse(one, one, one)
     with pytest.raises(ConfigError, match="finite positions at increasing times"):
         WaypointCourse(np.array([1.0, 0.0]), np.zeros(2), np.zeros(2))
-    with pytest.raises(ConfigError, match="radius must be positive"):
+    with pytest.raises(ConfigError, match="a turn needs radius and speed > 0, found -5"):
         TurningCourse(StraightCourse(START, 1.0, 1.0, 1.0), START, 10.0, -5.0)

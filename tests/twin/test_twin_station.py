@@ -8,6 +8,7 @@ import numpy as np
 import obspy
 import pandas as pd
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import welch
 
 from obsnet.errors import AISError, ConfigError, OutputError
@@ -21,7 +22,7 @@ from obsnet.twin.course import WaypointCourse, local_projection
 from obsnet.twin.faults import Faults, Gap
 from obsnet.twin.instrument import Recorder
 from obsnet.twin.sea import Ambient
-from obsnet.twin.ship import Ship
+from obsnet.twin.ship import LineSeries, Ship
 from obsnet.twin.station import (
     Passage,
     Scenario,
@@ -97,6 +98,21 @@ def test_other_rates_record_the_same_sound(half_hour, rate):
         assert fast.size == 15 * 60 * rate
         low, high = (np.fft.rfft(x * np.hanning(x.size))[900:18_000] / x.size for x in (slow, fast))
         assert np.linalg.norm(high - low) < 0.02 * np.linalg.norm(low)
+
+
+def test_a_rate_that_is_no_whole_number_records_the_same_lines():
+    tones = Ship(source_level_db=60.0, lines=(LineSeries(1.5, (3, 4, 5), (195.0, 192.0, 190.0)),))
+    asked = scenario(passages=(Passage(tones, COURSE),), ambient=None, hours=0.1)
+    plain = counts(simulate(asked, TABLE), "BDH")[1000:17_000]
+    rate = 49.9987
+    (trace,) = simulate(asked.replace(recorder=Recorder(sampling_rate=rate)), TABLE).stream.select(
+        channel="BDH"
+    )
+    assert trace.stats.sampling_rate == rate
+    assert 0.0 <= trace.stats.starttime.timestamp - START <= 1 / rate
+    time = trace.stats.starttime.timestamp - START + trace.times()
+    resampled = CubicSpline(time, trace.data)(np.arange(1000, 17_000) / 50.0)
+    assert np.linalg.norm(resampled - plain) < 0.03 * np.linalg.norm(plain)
 
 
 def intensity_azimuth(simulation) -> tuple[float, float]:
