@@ -8,17 +8,24 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from obsnet.ais import ReferenceTrack
 from obsnet.layout import to_posix
 from obsnet.plots import style
-from obsnet.run import Run, travel_time
+from obsnet.ocean.rays import travel_time
+from obsnet.run import Run
 from obsnet.trackers.track import Track
 
 Kind = Literal["azimuth", "range"]
 NUMBERED = 12
 """With more tracks than this in a picture, numbers would hide it."""
+SPARSE = 40
+"""With more AIS reports than this in a picture, the course is known everywhere."""
+APPROACH, DEPARTURE, UNKNOWN = style.PURPLE, style.ORANGE, "#999999"
 
 
 @dataclass(frozen=True)
@@ -31,20 +38,21 @@ class Curve:
     range_rate: np.ndarray
 
     def on(self, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
-        """Time and azimuth [deg] or range [km]; an azimuth curve is cut where it passes north."""
+        """Time on a picture's axis, and azimuth [deg] or range [km]; an azimuth is cut where it passes north."""
         if kind == "range":
-            return self.time, self.range_m / 1e3
+            return style.days(self.time), self.range_m / 1e3
         cut = np.flatnonzero(np.abs(np.diff(self.azimuth)) > 180.0) + 1
-        return np.insert(self.time, cut, np.nan), np.insert(self.azimuth, cut, np.nan)
+        return style.days(np.insert(self.time, cut, np.nan)), np.insert(self.azimuth, cut, np.nan)
 
 
 def heard(track: Track, delay: Callable, step_s: float = 60.0) -> Curve:
     """A track as the station hears it: what is heard at t left the ship at e, e + delay(range(e)) = t.
 
-    The range rate is that of the range heard, the ship's own over 1 + (ddelay/drange) rate. The azimuth is NaN where the
-    course was not observed.
+    The range rate is that of the range heard, the ship's own over 1 + (ddelay/drange) rate. The azimuth is NaN
+    where the course was not observed.
     """
-    time = np.linspace(track.start, track.end, int(np.clip((track.end - track.start) / step_s, 2, 400)))
+    count = int(np.clip((track.end - track.start) / step_s, 2, 400))
+    time = np.linspace(track.start, track.end, count)
     emitted = time
     for _ in range(6):
         emitted = time - np.asarray(delay(track.motion.observables(emitted)[1]), float)
@@ -66,52 +74,55 @@ def reference_heard(ship: ReferenceTrack, delay: Callable, start: float, end: fl
 
 def detections(ax: Axes, run: Run, kind: Kind, start: float, end: float, size: float = 2.8) -> None:
     """Each minute's azimuth or range."""
-    found = run.detections
-    values = _detected(run, kind)
-    seconds = to_posix(found["time"].to_numpy())
-    shown = np.isfinite(values) & (seconds >= start) & (seconds <= end)
-    mark = {"mfc": "white", "mec": "black", "mew": 0.4, "ls": "", "zorder": 3}
-    ax.plot(style.days(seconds[shown]), values[shown], "o", ms=size, **mark)
+    time, values, _ = _detected(run, kind, start, end)
+    ax.plot(time, values, "o", ms=size, mfc="white", mec="black", mew=0.4, ls="", zorder=3)
 
 
-def detections_by_rate(ax: Axes, run: Run, start: float, end: float, size: float = 9.0) -> Any:
-    """Each minute's range, coloured by range rate: ▼ approaching, ▲ leaving."""
-    seconds, values = to_posix(run.detections["time"].to_numpy()), _detected(run, "range")
-    rate = run.detections["range_rate_mps"].to_numpy(float)
-    inside = np.isfinite(values) & (seconds >= start) & (seconds <= end)
+def detections_by_rate(ax: Axes, run: Run, start: float, end: float, size: float = 12.0) -> Any:
+    """Each minute's range, coloured by range rate: ▼ approaching, ▲ leaving. Returns what a colour bar takes."""
+    time, values, rate = _detected(run, "range", start, end)
     drawn = None
     for marker, which in (("v", rate <= 0), ("^", rate > 0)):
-        shown = inside & which
         drawn = ax.scatter(
-            style.days(seconds[shown]), values[shown], s=size, c=rate[shown], marker=marker, cmap=style.DIVERGING,
-            vmin=-12.0, vmax=12.0, linewidths=0.25, edgecolors="black", zorder=3,
+            time[which], values[which], s=size, c=rate[which], marker=marker, cmap=style.DIVERGING,
+            vmin=-12.0, vmax=12.0, linewidths=0.3, edgecolors="black", zorder=6,
         )  # fmt: skip
     return drawn
 
 
-def curves(
-    ax: Axes,
-    run: Run,
-    reference: list[ReferenceTrack],
-    kind: Kind,
-    start: float,
-    end: float,
-    tracks: bool = True,
-) -> None:
+def curves(ax: Axes, run: Run, reference: list[ReferenceTrack], kind: Kind, start: float, end: float) -> None:
     """Tracks and AIS as heard."""
     delay = travel_time(run.table)
-    here = [
-        (n, track) for n, track in enumerate(run.tracks) if track.end > start and track.start < end and tracks
-    ]
+    here = [(n, track) for n, track in enumerate(run.tracks) if track.end > start and track.start < end]
     for number, track in here:
         time, values = heard(track, delay).on(kind)
-        ax.plot(style.days(time), values, lw=1.3, zorder=4, **style.track_style(number))
-        if len(here) > 1 and len(here) <= NUMBERED:
-            _number(ax, number, time, values)
+        ax.plot(time, values, lw=1.3, zorder=4, **style.track_style(number))
+        if len(run.tracks) > 1 and len(here) <= NUMBERED:
+            inside = np.flatnonzero(
+                (time >= style.days(start)) & (time <= style.days(end)) & np.isfinite(values)
+            )
+            if len(inside):
+                middle = inside[len(inside) // 2]
+                style.number(ax, number, time[middle], values[middle])
     for ship in reference:
         curve = reference_heard(ship, delay, start, end)
         if curve is not None:
-            draw_reference(ax, *_on_days(curve.on(kind)))
+            draw_reference(ax, *curve.on(kind))
+
+
+def reports(
+    ax: Axes, run: Run, reference: list[ReferenceTrack], kind: Kind, start: float, end: float
+) -> None:
+    """AIS reports themselves where they are sparse, at the time at which the ship there is heard."""
+    delay = travel_time(run.table)
+    for ship in reference:
+        azimuth, distance, rate = ship.observables(ship.time)
+        time = ship.time + np.asarray(delay(distance), float)
+        shown = (time >= start) & (time <= end) & (ship.time >= ship.starttime) & (ship.time <= ship.endtime)
+        if shown.sum() > SPARSE:
+            continue
+        curve = Curve(time[shown], azimuth[shown], distance[shown], rate[shown])
+        ax.plot(*curve.on(kind), "s", ms=2.4, mfc="black", mec="white", mew=0.3, ls="", zorder=5)
 
 
 def draw_reference(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
@@ -121,14 +132,14 @@ def draw_reference(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def shade_segments(ax: Axes, run: Run, start: float, end: float) -> None:
-    """Segments behind a panel: approach blue, departure orange, unknown grey; dotted edges, dashed CPA."""
+    """Segments behind a panel: approach and departure each in a colour, dotted edges, CPA dashed."""
     for segment in run.segments:
         if segment.end < start or segment.start > end:
             continue
         cpa = segment.cpa
-        parts = [(segment.start, segment.end, "#999999")]
+        parts = [(segment.start, segment.end, UNKNOWN)]
         if cpa is not None:
-            parts = [(segment.start, cpa, style.PURPLE), (cpa, segment.end, style.ORANGE)]
+            parts = [(segment.start, cpa, APPROACH), (cpa, segment.end, DEPARTURE)]
             ax.axvline(style.days(cpa), color="black", lw=0.8, ls="--", zorder=1)
         for begin, stop, colour in parts:
             ax.axvspan(style.days(begin), style.days(stop), color=colour, alpha=0.18, lw=0, zorder=0)
@@ -136,24 +147,40 @@ def shade_segments(ax: Axes, run: Run, start: float, end: float) -> None:
             ax.axvline(style.days(edge), color="black", lw=0.8, ls=":", zorder=1)
 
 
-def _detected(run: Run, kind: Kind) -> np.ndarray:
-    if kind == "azimuth":
-        return run.detections["azimuth_deg"].to_numpy(float)
-    return run.detections["range_m"].to_numpy(float) / 1e3
+def handles(run: Run, reference: list[ReferenceTrack], by_rate: bool = False) -> list[Any]:
+    """Legend entries of what overlays draw."""
+    mark: dict[str, Any] = {"mec": "black", "mew": 0.5, "ls": ""}
+    made: list[Any] = [Line2D([], [], marker="o", ms=4, mfc="white", label="detection", **mark)]
+    if by_rate:
+        made.append(Line2D([], [], marker="v", ms=4, mfc="#8073AC", label="approaching", **mark))
+        made.append(Line2D([], [], marker="^", ms=4, mfc="#E08214", label="leaving", **mark))
+    if run.tracks:
+        made.append(Line2D([], [], color=style.track_style(0)["color"], lw=1.8, label="track"))
+    if reference:
+        text = f"AIS ({len(reference)} ship{'s' if len(reference) > 1 else ''})"
+        made.append(Line2D([], [], color="black", ls=style.REFERENCE_DASHES, lw=1.1, label=text))
+    return made
 
 
-def _on_days(curve: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return style.days(curve[0]), curve[1]
+def legend(
+    made: Figure, run: Run, reference: list[ReferenceTrack], by_rate: bool = False, segments: bool = False
+) -> None:
+    """One line of legend below the title."""
+    entries = handles(run, reference, by_rate)
+    if segments and run.segments:
+        both = ((APPROACH, "approach"), (DEPARTURE, "departure"))
+        entries += [Patch(fc=colour, alpha=0.18, ec="black", ls=":", label=text) for colour, text in both]
+    width, height = made.get_size_inches()
+    made.legend(
+        handles=entries, loc="center left", bbox_to_anchor=(0.65 / width, 1.0 - 0.47 / height), ncols=len(entries),
+        fontsize=8.5, frameon=False, columnspacing=1.4, handlelength=1.8,
+    )  # fmt: skip
 
 
-def _number(ax: Axes, number: int, time: np.ndarray, values: np.ndarray) -> None:
-    middle = len(time) // 2
-    if np.isfinite(values[middle]):
-        frame = {
-            "boxstyle": "circle,pad=0.15",
-            "fc": "white",
-            "ec": style.track_style(number)["color"],
-            "lw": 1.0,
-        }
-        ax.text(style.days(time[middle]), values[middle], str(number + 1), fontsize=7, ha="center", va="center",
-                bbox=frame, clip_on=True, zorder=7)  # fmt: skip
+def _detected(run: Run, kind: Kind, start: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times on a picture's axis, azimuths [deg] or ranges [km], and range rates [m/s] of the detections."""
+    found = run.detections
+    column, scale = ("azimuth_deg", 1.0) if kind == "azimuth" else ("range_m", 1e-3)
+    values, seconds = found[column].to_numpy(float) * scale, to_posix(found["time"].to_numpy())
+    shown = np.isfinite(values) & (seconds >= start) & (seconds <= end)
+    return style.days(seconds[shown]), values[shown], found["range_rate_mps"].to_numpy(float)[shown]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.image import AxesImage
@@ -25,7 +24,8 @@ def spectrogram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     """Power spectral density of the pressure, or of the ground's motion without a hydrophone."""
     power = run.features.get("power")
     if power is None:
-        return without(ax, "frequency [Hz]", "no spectrogram")
+        without(ax, "frequency [Hz]", "no spectrogram")
+        return
     bandwidth = HANN_NOISE_BINS / run.config.spectra.window_s
     # The spectra give a tone its amplitude; its mean square is half the amplitude's.
     density = columns.mean(power) / (2.0 * bandwidth)
@@ -43,7 +43,8 @@ def azigram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     """Azimuth of the sound in each cell of time and frequency, in cyclic colours."""
     phasor = run.features.get("azigram")
     if phasor is None:
-        return without(ax, "frequency [Hz]", NO_AZIMUTH)
+        without(ax, "frequency [Hz]", NO_AZIMUTH)
+        return
     azimuth = np.rad2deg(np.angle(columns.mean(phasor))) % 360.0
     frequency = phasor["frequency"].values
     picture = image(ax, azimuth, columns, frequency, style.CYCLIC, 0.0, 360.0)
@@ -56,7 +57,8 @@ def cepstrogram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     """Envelope of the cepstrum, up to the longest delay between the first two paths."""
     cepstra = run.features.get("cepstrogram")
     if cepstra is None:
-        return without(ax, "quefrency [s]", NO_RANGE)
+        without(ax, "quefrency [s]", NO_RANGE)
+        return
     part = cepstra.sel(quefrency=slice(0.0, longest_quefrency(run) + 0.5))
     quefrency = part["quefrency"].values
     level = np.sqrt(columns.mean(part, squared_envelope))
@@ -71,7 +73,8 @@ def azimuth_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     """Log-likelihood ratio of a ship at each azimuth."""
     style.azimuth_axis(ax)
     if "azimuth_llr" not in run.maps:
-        return style.say(ax, NO_AZIMUTH)
+        style.say(ax, NO_AZIMUTH)
+        return
     values = azimuth_columns(run.maps, columns, run.detections["azimuth_llr"].to_numpy(float))
     picture = image(ax, values, columns, run.maps["azimuth"].values, style.SEQUENTIAL, *_llr_limits(values))
     style.azimuth_axis(ax)
@@ -82,33 +85,14 @@ def azimuth_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
 def range_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     """Log-likelihood ratio of a ship at each range, range rate marginalised."""
     if "range_llr" not in run.maps:
-        return without(ax, "range [km]", NO_RANGE)
+        without(ax, "range [km]", NO_RANGE)
+        return
     values = range_columns(run.maps, columns, run.detections["range_llr"].to_numpy(float))
     range_km = run.maps["range"].values / 1e3
     picture = image(ax, values, columns, range_km, style.SEQUENTIAL, *_llr_limits(values))
-    style.y_axis(ax, "range [km]", 0.0, range_km[-1])
+    style.y_axis(ax, "range [km]", 0.0, farthest_km(run))
     if bar:
         style.bar(ax, picture, "log-likelihood ratio")
-
-
-def against_range(ax: Axes, run: Run, envelope: xr.DataArray, label: str) -> None:
-    """An envelope with dims (range, quefrency) in km and s."""
-    range_km, quefrency = envelope["range"].values / 1e3, envelope["quefrency"].values
-    values = envelope.values
-    low, high = np.percentile(_finite(values[:, quefrency > 0.5]), [0, 99.8])
-    extent = (range_km[0], range_km[-1], quefrency[0], quefrency[-1])
-    norm = Normalize(low, high if high > low else low + 1.0)
-    picture = ax.imshow(
-        values.T,
-        origin="lower",
-        aspect="auto",
-        extent=extent,
-        cmap=style.SEQUENTIAL,
-        norm=norm,
-        interpolation="nearest",
-    )
-    style.y_axis(ax, "quefrency [s]", 0.0, longest_quefrency(run))
-    style.bar(ax, picture, label)
 
 
 def image(
@@ -127,6 +111,12 @@ def squared_envelope(cepstra: np.ndarray) -> np.ndarray:
     """Squared modulus of the analytic signal along quefrency, of cepstra (minute, quefrency)."""
     analytic = hilbert(cepstra, axis=1)
     return (analytic.real**2 + analytic.imag**2).astype(np.float32)
+
+
+def farthest_km(run: Run) -> float:
+    """Top of the range axes [km]."""
+    farthest = run.maps["range"].values[-1] if "range" in run.maps else run.config.range.max_range_m
+    return float(np.ceil(farthest / 100.0) / 10.0)
 
 
 def longest_quefrency(run: Run) -> float:

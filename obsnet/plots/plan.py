@@ -133,9 +133,7 @@ def _track(ax: Axes, track: Track, number: int, label: bool) -> None:
     ax.annotate("", (east[-1], north[-1]), (east[-6], north[-6]), zorder=3.5,
                 arrowprops={"arrowstyle": "-|>", "color": look["color"], "lw": 1.8})  # fmt: skip
     if label:
-        frame = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": look["color"], "lw": 1.0}
-        ax.text(east[-8], north[-8], str(number + 1), fontsize=7, ha="center", va="center", bbox=frame, clip_on=True,
-                zorder=7)  # fmt: skip
+        style.number(ax, number, east[-8], north[-8])
 
 
 def _draw_track(ax: Axes, track: Track, number: int, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -53,7 +53,7 @@ def report(run: Run, path: str | Path | None = None, reference: list[ReferenceTr
         found = f"{count} ship{'s' if count > 1 else ''} found" if count else "no ship found"
         title = f"{run.station.code}, {style.span(columns.start, columns.end)}: {found}"
         _fill(made, run, reference or [], columns)
-    made.text(_LEFT / _PAGE[0], 0.975, title, ha="left", va="center", fontsize=13)
+    style.title(made, title)
     if path is not None:
         style.save(made, path)
     return made
@@ -91,18 +91,14 @@ def _fill(made: Figure, run: Run, reference: list[ReferenceTrack], columns: Colu
 
 
 def _legend(ax: Axes, run: Run, reference: list[ReferenceTrack]) -> None:
-    mark = {"marker": "o", "ms": 4, "mec": "black", "mew": 0.5, "ls": ""}
-    handles: list = [
-        Line2D([], [], marker="*", ms=10, mfc=style.YELLOW, mec="black", ls="", label="station"),
-        Line2D([], [], mfc="white", label="detection (grey on the plan)", **mark),  # type: ignore[arg-type]
-    ]
+    handles = overlay.handles(run, reference)
+    handles.insert(
+        0, Line2D([], [], marker="*", ms=10, mfc=style.YELLOW, mec="black", ls="", label="station")
+    )
+    handles.append(Line2D([], [], marker=".", ms=5, color="#888888", ls="", label="detection on the plan"))
     if run.tracks:
-        colour = style.track_style(0)["color"]
-        handles.append(Line2D([], [], color=colour, lw=1.8, label="track"))
-        handles.append(Patch(fc=colour, ec="black", alpha=0.55, label="90 % at closest approach"))
-    if reference:
-        text = f"AIS ({len(reference)} ship{'s' if len(reference) > 1 else ''})"
-        handles.append(Line2D([], [], color="black", ls=style.REFERENCE_DASHES, lw=1.1, label=text))
+        patch = {"fc": style.track_style(0)["color"], "ec": "black", "alpha": 0.55}
+        handles.append(Patch(label="90 % at closest approach", **patch))
     ax.legend(handles=handles, loc="upper left", ncols=2, fontsize=8.5, frameon=False, borderaxespad=0)
 
 

@@ -85,12 +85,11 @@ def _whole_days(ticks: np.ndarray) -> bool:
     return bool(len(ticks) > 1 and ((ticks[1] - ticks[0]) % _DAY == 0))
 
 
-def azimuth_axis(ax: Axes, named: bool = True) -> None:
+def azimuth_axis(ax: Axes) -> None:
     """Azimuth from 0° to 360°, a tick at each cardinal point."""
     ax.set_ylim(0.0, 360.0)
-    ax.set_yticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"], fontsize=8)
-    if named:
-        ax.set_ylabel("azimuth", fontsize=9)
+    ax.set_yticks([0, 90, 180, 270, 360], ["N 0", "E 90", "S 180", "W 270", "N 360"], fontsize=8)
+    ax.set_ylabel("azimuth [°]", fontsize=9)
 
 
 def y_axis(ax: Axes, label: str, low: float, high: float, most: int = 6) -> None:
@@ -140,6 +139,18 @@ def name(ax: Axes, text: str) -> None:
     frame = {"boxstyle": "square,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
     ax.annotate(text, (0, 1), (5, -5), xycoords="axes fraction", textcoords="offset points", ha="left", va="top",
                 fontsize=8.5, bbox=frame, zorder=9)  # fmt: skip
+
+
+def number(ax: Axes, index: int, x: float, y: float) -> None:
+    """The number of track `index` (from 0) in a circle of its colour."""
+    frame = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": track_style(index)["color"], "lw": 1.0}
+    ax.text(x, y, str(index + 1), fontsize=7, ha="center", va="center", bbox=frame, clip_on=True, zorder=8)
+
+
+def title(made: Figure, text: str) -> None:
+    """What a page shows, at its upper left."""
+    width, height = made.get_size_inches()
+    made.text(0.75 / width, 1.0 - 0.22 / height, text, ha="left", va="center", fontsize=12)
 
 
 def span(start: float, end: float) -> str:
