@@ -30,24 +30,21 @@ class FocalizationConfig:
     detection_probability : per pair, where both its paths exist; one value serves every pair.
     tdoa_std_s : standard deviation of a measured delay, s, per pair or one for all.
     false_alarms : mean number per scan, uniform between `min_tdoa_s` and `max_tdoa_s`, outside of which no
-    delay is looked
-        at. Where `false_alarm_memory_s` is finite it is the start of a running mean of what the source does
-        not explain.
+        delay is looked at. Where `false_alarm_memory_s` is finite it is the start of a running mean of what
+        the source does not explain.
     max_range_m, range_prior : the area of interest; `uniform` in range as in the paper, or `area`,
-    proportional to range.
+        proportional to range.
     max_source_depth_m : the source's depth is uniform down to here, 0 for a ship.
     rate_prior, rate_scale_mps : range rate, normal with this standard deviation as in the paper, or uniform
-    within ±.
+        within ±.
     acceleration_std_mps2, depth_rate_std_mps : driving noise of eq. (4), constant over a scan.
     range_diffusion_m : m per √s, a regularisation that keeps resampled particles apart; 0 in the paper.
     particles : J. After each scan they are resampled where the effective sample size is below J/2, and always
-    when there
-        are births.
+        when there are births.
     survival_s, birth_s : mean time that a source stays and that passes until the next comes; infinite: it is
-    there.
+        there.
     jump_s : mean time until the source is looked for anew in the whole prior though it exists: what gets the
-    filter off a
-        ghost branch.
+        filter off a ghost branch.
     birth_share : births per scan as a share of J, with as much weight as birth and jump give them.
     """
 
@@ -187,8 +184,7 @@ class FocalizationFilter:
         Parameters
         ----------
         measured_s : array, dims (measurement,), s, without labels; empty where nothing was detected, None
-        where there was
-            no scan (a gap).
+            where there was no scan (a gap).
         elapsed_s : s since the scan before; 0 for the first.
         receiver_depth_m : m, where the model asks for it.
 

@@ -72,18 +72,16 @@ class StationScans:
     detections : dims (scan,), number of delays detected.
     range_mean_m, range_std_m : dims (scan,), of the posterior, given that there is a ship; m.
     range_mode_m, mode_probability : the densest range [m] and the share of the posterior within 1 km of it.
-    Where several
-        branches are open the mean lies between them and the mode on one.
+        Where several branches are open the mean lies between them and the mode on one.
     range_rate_mps, range_rate_std_mps : dims (scan,), m/s.
     log_evidence : dims (scan,), log-likelihood ratio of the scan's delays, a ship as predicted against none.
     existence_llr : dims (scan,), log posterior odds of a ship.
     travel_time_s : dims (scan,), s: what is heard at `time_s` left the ship so long before, were it at the
-    mode.
+        mode.
     range_m : dims (range,), m.
     log_density : dims (scan, range), log posterior density of range, per metre, of all scans so far.
     scan_llr : dims (scan, range), log-likelihood ratio of this scan's delays alone: a detector's map, which
-    another tracker
-        may sum over scans; NaN in gaps.
+        another tracker may sum over scans; NaN in gaps.
     """
 
     time_s: np.ndarray
@@ -127,7 +125,7 @@ class StationFocalization:
     table : propagation table, dims (path, range).
     config : StationFocalizationConfig
     amplitudes : cepstral amplitude of each pair against range, where it is known: it tells where a pair
-    cannot be seen.
+        cannot be seen.
     """
 
     def __init__(
@@ -161,7 +159,7 @@ class StationFocalization:
 
         A record pushed in pieces gives the scans of the whole. They come `config.detection.context_s` late.
         """
-        values, times = np.asarray(values), np.asarray(times_s, float)
+        values, times = np.asarray(values, float), np.asarray(times_s, float)
         if len(self._times) and (len(values) != len(self._values) or not np.all(times > self._times[-1])):
             raise LayoutError("the next cepstra must follow those before, on the same quefrencies")
         self._quefrency = np.asarray(quefrency_s, float)

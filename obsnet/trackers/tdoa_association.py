@@ -7,7 +7,7 @@ label, so their likelihood sums over every valid assignment of measurements to p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import erf
+from math import erfc
 from typing import Protocol
 
 import numpy as np
@@ -34,6 +34,9 @@ LEAST_VISIBILITY = 0.02
 
 UNDERFLOW_SIGMAS = 38.6
 """exp(−x²/2) is zero in double precision beyond this many standard deviations."""
+
+NEVER_SIGMAS = 9.0
+"""The tail of a normal distribution beyond this many standard deviations is less than 1's rounding."""
 
 
 class TdoaModel(Protocol):
@@ -122,12 +125,11 @@ class TableModel:
     Parameters
     ----------
     table : Dataset with dims (path, range), as of `obsnet.ocean.rays`; a path's delay is NaN where it does
-    not exist.
+        not exist.
     pairs : names such as "1-3": two numbers of water-column crossings that the table holds.
-    amplitudes : cepstral amplitude a(r) of each pair, where it is known. A pair is then seen with a²/(a² +
-    a_½²) of its
-        probability of detection, and never with less than 2 % of it: amplitudes are averages over ships.
-    half_amplitude : a_½, at which the better ship's ridge is seen every other time.
+    amplitudes : cepstral amplitude a(r) of each pair, where it is known. The probability of detection is then
+        reduced by a²/(a² + a_½²), to 2 % at least: amplitudes are averages over ships.
+    half_amplitude : a_½, at which a pair is seen half as often as at best.
     range_step_m : m, spacing of the uniform grid between whose points delays are interpolated linearly.
 
     Raises
@@ -279,10 +281,13 @@ def _serve(served, ratio):
 
 @njit(cache=True, nogil=True)
 def _inside(predicted, std, low, high):
-    if low + 6.0 * std < predicted < high - 6.0 * std:
-        return 1.0
     root = std * np.sqrt(2.0)
-    return 0.5 * (erf((high - predicted) / root) - erf((low - predicted) / root))
+    inside = 1.0
+    if predicted < low + NEVER_SIGMAS * std:
+        inside -= 0.5 * erfc((predicted - low) / root)
+    if predicted > high - NEVER_SIGMAS * std:
+        inside -= 0.5 * erfc((high - predicted) / root)
+    return inside
 
 
 @njit(cache=True, nogil=True)

@@ -22,22 +22,18 @@ class TdoaDetectionConfig:
     ----------
     min_tdoa_s, max_tdoa_s : delays looked for, s.
     envelope : take the modulus of the analytic cepstrum along quefrency, free of the arrivals' phases; else
-    that of the
-        cepstrum itself, as the paper does.
+        that of the cepstrum itself, as the paper does.
     centre_frequency_hz, pulse_width_s : with `envelope`, the pulse exp(−τ²/2Δτ²) at this frequency that the
-    cepstrum is
-        matched with (Trabattoni et al. 2023, eq. 17); no matching where the width is 0.
+        cepstrum is matched with (Trabattoni et al. 2023, eq. 17); no matching where the width is 0.
     stack_s, scan_step_s, max_drift : with `envelope`, frames within a window of this length are averaged
-    along straight
-        ridges of every slope up to this one [s/s], at UTC multiples of the step, and the best slope counts: a
-        delay changes by milliseconds per second, so that frames add up in phase. Every frame is a scan of its
-        own where `stack_s` is 0.
+        along straight ridges of every slope up to this one [s/s], at UTC multiples of the step, and the best
+        slope counts: a delay changes by milliseconds per second, so that frames add up in phase. Every frame
+        is a scan of its own where `stack_s` is 0.
     background_tdoa_s, background_time_s : sides of the window of the two-dimensional running median.
     threshold : peaks must exceed the median by this factor.
     cluster_tdoa_s, cluster_time_s, cluster_points : DBSCAN. A peak is kept where it lies in a cluster: at
-    least
-        `cluster_points` peaks, itself included, within an ellipse of these semi-axes, or one such peak's
-        neighbour.
+        least `cluster_points` peaks, itself included, within an ellipse of these semi-axes, or one such
+        peak's neighbour.
     """
 
     min_tdoa_s: float = 0.3
@@ -50,7 +46,7 @@ class TdoaDetectionConfig:
     max_drift: float = 2.5e-3
     background_tdoa_s: float = 1.0
     background_time_s: float = 300.0
-    threshold: float = 1.8
+    threshold: float = 1.6
     cluster_tdoa_s: float = 0.16
     cluster_time_s: float = 130.0
     cluster_points: int = 3
@@ -74,6 +70,11 @@ class TdoaDetectionConfig:
             raise ConfigError(
                 "pulse_width_s and centre_frequency_hz must not be negative, found "
                 f"{self.pulse_width_s} s and {self.centre_frequency_hz} Hz"
+            )
+        if self.stack_s < 0 or self.max_drift < 0 or not self.scan_step_s > 0:
+            raise ConfigError(
+                "stack_s and max_drift must not be negative and scan_step_s must be positive, found "
+                f"{self.stack_s} s, {self.max_drift} s/s and {self.scan_step_s} s"
             )
         if self.cluster_points < 1:
             raise ConfigError(f"cluster_points must be at least 1, found {self.cluster_points}")
@@ -162,13 +163,12 @@ def detect_tdoas(
 def scan_envelope(
     values: np.ndarray, step_s: float, times_s: np.ndarray, config: TdoaDetectionConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times of the scans [s], whether they hold data, and the cepstrum's envelope there, dims (quefrency,
-    scan).
+    """Times of the scans [s], whether they hold data, and the envelope there, dims (quefrency, scan).
 
-    With the Fourier transform Y(ν, t) of the analytic, matched cepstrum along quefrency, a slope s and a
-    window W of valid frames around t, the envelope is max_s |F⁻¹ mean_W Y(ν, t') exp(2πiν s (t' − t))|: a
-    pulse a·cos(2πf₀(τ−τ₀)+φ)·exp(−(τ−τ₀)²/2Δτ²) that drifts along a straight ridge peaks at τ₀(t), whatever
-    φ.
+    A window that holds less than half of its frames is a gap. With the Fourier transform Y(ν, t) of the
+    analytic, matched cepstrum along quefrency, a slope s and a window W of valid frames around t, the
+    envelope is max_s |F⁻¹ mean_W Y(ν, t') exp(2πiν s (t' − t))|: a pulse
+    a·cos(2πf₀(τ−τ₀)+φ)·exp(−(τ−τ₀)²/2Δτ²) that drifts along a straight ridge peaks at τ₀(t), whatever φ.
     """
     there = np.isfinite(values).all(axis=0)
     clean = np.where(there, values, 0.0)
@@ -179,20 +179,27 @@ def scan_envelope(
     spectrum = scipy.fft.fft(clean, size, axis=0)[response > 0] * response[response > 0, None]
     if config.stack_s == 0:
         return times_s, there, _modulus(spectrum, response > 0, len(values))
-    stepping = config.scan_step_s
-    scans = stepping * np.arange(
-        np.ceil(times_s[0] / stepping - 1e-9), np.floor(times_s[-1] / stepping + 1e-9) + 1
-    )
-    left = np.searchsorted(times_s, scans - config.stack_s / 2 - 1e-6)
-    right = np.searchsorted(times_s, scans + config.stack_s / 2 + 1e-6)
+    scans, left, right = _windows(times_s, config)
     total = np.concatenate([[0], np.cumsum(there)])
     count = total[right] - total[left]
+    whole = config.stack_s / np.diff(times_s).min(initial=config.stack_s)
     envelope = np.zeros((len(values), len(scans)))
     for drift in _drifts(config):
         stacked = _stack(spectrum, frequency[response > 0] * drift, times_s, scans, left, right)
         stacked /= np.maximum(count, 1)
         np.maximum(envelope, _modulus(stacked, response > 0, len(values)), out=envelope)
-    return scans, count > 0, envelope
+    return scans, count >= whole / 2, envelope
+
+
+def _windows(times_s: np.ndarray, config: TdoaDetectionConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times of the scans [s] around which something was recorded; first and one-past-last frame of each."""
+    first = np.ceil(times_s[0] / config.scan_step_s - 1e-9)
+    last = np.floor(times_s[-1] / config.scan_step_s + 1e-9)
+    scans = config.scan_step_s * np.arange(first, last + 1)
+    left = np.searchsorted(times_s, scans - config.stack_s / 2 - 1e-6)
+    right = np.searchsorted(times_s, scans + config.stack_s / 2 + 1e-6)
+    recorded = right > left
+    return scans[recorded], left[recorded], right[recorded]
 
 
 def _matched_band(size: int, step_s: float, config: TdoaDetectionConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -279,13 +286,15 @@ def _peaks(
 def _checked(
     values: np.ndarray, quefrency_s: np.ndarray, times_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    values = np.asarray(values)
+    values = np.asarray(values, float)
     quefrency, times = np.asarray(quefrency_s, float), np.asarray(times_s, float)
     if values.shape != (len(quefrency), len(times)):
         raise LayoutError(
             f"a cepstrogram must have dims (quefrency, time) = ({len(quefrency)}, {len(times)}), "
             f"found {values.shape}"
         )
+    if not len(times):
+        raise LayoutError("the cepstrogram holds no frame; nothing can be detected in it")
     steps = np.diff(quefrency)
     if len(steps) < 2 or not (steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-3)):
         raise LayoutError("the quefrency axis must be uniform and increasing, with three points at least")
