@@ -89,7 +89,8 @@ def test_blocks_are_the_whole_record_and_have_no_seam(monkeypatch):
 
 
 @pytest.mark.parametrize("rate", [62.5, 100.0, 125.0, 250.0])
-def test_other_rates_record_the_same_sound(half_hour, rate):
+def test_other_rates_record_the_same_sound(half_hour, monkeypatch, rate):
+    monkeypatch.setattr(twin, "BLOCK_S", 900.0)
     recorder = Recorder(sampling_rate=rate)
     other = simulate(scenario(recorder=recorder, hours=0.25), TABLE)
     for part, code in recorder.channels.items():
