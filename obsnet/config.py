@@ -90,7 +90,7 @@ def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str
         raise ConfigError(
             f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}"
         ) from None
-    return {str(key): value for key, value in plain.items()}
+    return {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
 
 
 def to_dict(config: Any) -> dict[str, Any]:

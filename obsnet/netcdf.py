@@ -90,7 +90,7 @@ class TimeWriter:
         for name, values in _real(block).items():
             values = values.transpose("time", ...)
             packed = name in PACKED
-            rows = max(1, int(2**18 // max(np.prod(values.shape[1:]), 1)))
+            rows = max(1, 2**18 // max(int(np.prod(values.shape[1:])), 1))
             variable = file.create_variable(
                 name,
                 values.dims,

@@ -116,7 +116,9 @@ class Pipeline:
             self._next = float(np.ceil(times[0] / self.config.azimuth.step_s) * self.config.azimuth.step_s)
         self._take(spectra)
         self._last = float(times[-1])
-        finished.append(self._finish(times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2))
+        finished.append(
+            self._finish(times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2)
+        )
         return [minutes for minutes in finished if minutes is not None]
 
     def flush(self) -> Minutes | None:
@@ -138,9 +140,9 @@ class Pipeline:
 
     def _finish(self, ready: float) -> Minutes | None:
         step = self.config.azimuth.step_s
-        count = int(np.floor((ready - self._next) / step + 1e-6)) + 1
-        if count <= 0:
+        if self._next is None or ready < self._next - 1e-6 * step:
             return None
+        count = int(np.floor((ready - self._next) / step + 1e-6)) + 1
         minutes = self._next + step * np.arange(count)
         parts = []
         if self._azigram is not None:
@@ -179,7 +181,8 @@ class Pipeline:
             self._null = None if self._null is None else self._null[:, keep]
         if self._cepstrogram is not None:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
-        self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+        if self._spectrogram is not None:
+            self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
 
 
 def _power(spectra: xr.Dataset) -> xr.DataArray:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -26,9 +26,9 @@ from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps
 from obsnet.errors import LayoutError, OutputError
 from obsnet.kinematics import StraightCourse, wrap180
-from obsnet.layout import from_posix, iso, to_posix
+from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import propagation, strongest_delay
+from obsnet.ocean.rays import propagation, travel_time
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
@@ -109,7 +109,7 @@ def track(
     station: Station,
     config: RunConfig | None = None,
     *,
-    detector: str | None = None,
+    detector: Literal["learned", "analytic"] | None = None,
     **options: Any,
 ) -> Run:
     """Waveforms to tracks.
@@ -163,7 +163,7 @@ def _run(
     clock.lap("model")
     sink = _FolderSink(folder, station) if folder is not None else _MemorySink()
     with sink:
-        for minutes in _stream(source, station, config, pipeline, progress, clock):
+        for minutes in _stream(source, config, pipeline, progress, clock):
             sink.append(minutes)
             clock.lap("write")
         maps, features = sink.close()
@@ -175,7 +175,9 @@ def _run(
     return run
 
 
-def _stream(source, station, config, pipeline, progress, clock) -> Iterator[Minutes]:
+def _stream(
+    source: Any, config: RunConfig, pipeline: Pipeline, progress: Progress | None, clock: _Clock
+) -> Iterator[Minutes]:
     for spectra in iter_spectra(source, config.spectra):
         clock.lap("spectra")
         finished = pipeline.push(spectra)
@@ -231,20 +233,6 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         delay=delay,
     )
     return [] if found is None else [found]
-
-
-def travel_time(table: xr.Dataset) -> Callable[[np.ndarray], np.ndarray]:
-    """Travel time [s] of the loudest path against range [m], carried on at its last slope beyond the table."""
-    delay = strongest_delay(table).dropna("range")
-    grid, values = delay["range"].values.astype(float), delay.values.astype(float)
-    slope = (values[-1] - values[-2]) / (grid[-1] - grid[-2])
-
-    def at(range_m: np.ndarray) -> np.ndarray:
-        distance = np.abs(np.asarray(range_m, float))
-        beyond = np.maximum(distance - grid[-1], 0.0)
-        return np.interp(distance, grid, values) + slope * beyond
-
-    return at
 
 
 class _MemorySink:

@@ -7,6 +7,7 @@ their grid.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -115,7 +116,7 @@ class RangeDetectorConfig:
     @property
     def range_rate(self) -> np.ndarray:
         """Range rate grid [m/s], symmetric about 0."""
-        half = int(round(self.max_range_rate_mps / self.range_rate_step_mps))
+        half = round(self.max_range_rate_mps / self.range_rate_step_mps)
         return np.arange(-half, half + 1) * self.range_rate_step_mps
 
 
@@ -174,7 +175,15 @@ class AnalyticAzimuthDetector:
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, config.azimuth, 360 // fold)
 
-    def _tonal(self, real, imag, null, times, minutes, angle) -> np.ndarray:
+    def _tonal(
+        self,
+        real: np.ndarray,
+        imag: np.ndarray,
+        null: np.ndarray,
+        times: np.ndarray,
+        minutes: np.ndarray,
+        angle: np.ndarray,
+    ) -> np.ndarray:
         config = self.config
         per_window = round(config.window_s / config.step_s)
         block_edges = minutes[0] - config.window_s / 2 + config.step_s * np.arange(len(minutes) + per_window)
@@ -239,12 +248,21 @@ class AnalyticRangeDetector:
             llr[lo:hi] = self._stack(scores, active, pad, *window).transpose(0, 2, 1)
 
         bounds = np.unique(np.append(np.arange(0, len(minutes), 8), len(minutes)))
-        _in_threads(one, list(zip(bounds[:-1], bounds[1:], strict=True)), self._threads)
+        _in_threads(one, list(itertools.pairwise(bounds)), self._threads)
         covered = coverage(valid, start, stop, minutes, config.window_s, _hop(times))
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 
-    def _stack(self, scores, active, pad, start, stop, times, minutes) -> np.ndarray:
+    def _stack(
+        self,
+        scores: np.ndarray,
+        active: np.ndarray,
+        pad: int,
+        start: np.ndarray,
+        stop: np.ndarray,
+        times: np.ndarray,
+        minutes: np.ndarray,
+    ) -> np.ndarray:
         """Sum over the pairs of the log of the wandering mean of exp(slant stack); (window, range rate, range) float32."""
         config = self.config
         n_range = len(config.range_m)
@@ -270,7 +288,9 @@ class AnalyticRangeDetector:
             total[:, :, lo:hi] += np.log(smooth, out=smooth)
         return total
 
-    def _scores(self, cepstrogram: xr.DataArray, frames: np.ndarray, valid: np.ndarray):
+    def _scores(
+        self, cepstrogram: xr.DataArray, frames: np.ndarray, valid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, int]:
         """Per-frame log-likelihood ratio of every pair and range: a matrix product with the matched pulses."""
         config = self.config
         quefrency = cepstrogram["quefrency"].values
@@ -389,7 +409,7 @@ _LLR = {"long_name": "natural log of the likelihood ratio, a ship here against n
 
 def _interp_phase(phase_deg: xr.DataArray, range_m: np.ndarray) -> np.ndarray:
     """Phase [rad] at `range_m`, interpolated on the circle."""
-    phasor = np.exp(1j * np.deg2rad(phase_deg))
+    phasor = phase_deg.copy(data=np.exp(1j * np.deg2rad(phase_deg.values)))
     return np.angle(phasor.interp(range=range_m).values)
 
 

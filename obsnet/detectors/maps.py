@@ -80,7 +80,9 @@ def range_rate_marginal(range_llr: np.ndarray) -> np.ndarray:
     return log_mean_exp(range_llr, axis=-1)
 
 
-def range_presence(range_llr: np.ndarray, range_m: np.ndarray, range_rate: np.ndarray) -> dict[str, np.ndarray]:
+def range_presence(
+    range_llr: np.ndarray, range_m: np.ndarray, range_rate: np.ndarray
+) -> dict[str, np.ndarray]:
     """Log marginal posterior ratios of presence: of any ship, of an `approaching` and of a `leaving` one.
 
     The prior is proportional to range and uniform in range rate (paper's eqs 20, 22); for a closing or an opening ship it is
@@ -110,7 +112,9 @@ def presence(maps: LikelihoodMaps) -> pd.DataFrame:
     LayoutError : the maps hold neither azimuth_llr nor range_llr.
     """
     if "azimuth_llr" not in maps and "range_llr" not in maps:
-        raise LayoutError(f"likelihood maps hold azimuth_llr or range_llr, found {', '.join(map(str, maps)) or 'nothing'}")
+        raise LayoutError(
+            f"likelihood maps hold azimuth_llr or range_llr, found {', '.join(map(str, maps)) or 'nothing'}"
+        )
     columns: dict[str, np.ndarray] = {}
     if "azimuth_llr" in maps:
         columns["azimuth"] = azimuth_presence(maps["azimuth_llr"].values)
@@ -139,7 +143,10 @@ def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.D
     """
     ratios = presence(maps) if ratios is None else ratios
     empty = np.full(maps.sizes["time"], np.nan)
-    table = {name: empty.copy() for name in ("azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr")}
+    table = {
+        name: empty.copy()
+        for name in ("azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr")
+    }
     covered = np.zeros(maps.sizes["time"])
     if "azimuth_llr" in maps:
         covered = np.maximum(covered, maps["azimuth_coverage"].values)
@@ -150,10 +157,10 @@ def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.D
         covered = np.maximum(covered, maps["range_coverage"].values)
         range_m, rate = maps["range"].values, maps["range_rate"].values
         table["range_llr"] = ratios["range"].to_numpy()
-        found = np.flatnonzero(table["range_llr"] > 0)
+        ranged = np.flatnonzero(table["range_llr"] > 0)
         with np.errstate(divide="ignore"):
             log_prior = np.log(np.maximum(range_m, 0.0)).astype(np.float32)[:, None]
-        for minute in found:
+        for minute in ranged:
             best = int((maps["range_llr"].values[minute] + log_prior).argmax())
             table["range_m"][minute] = range_m[best // len(rate)]
             table["range_rate_mps"][minute] = rate[best % len(rate)]

@@ -107,9 +107,8 @@ def _reason(error: Exception) -> str:
 
 
 def _delay_of_run(config: dict[str, Any], depth_m: float) -> DelayFunction:
-    from obsnet.ocean.rays import propagation_table
+    from obsnet.ocean.rays import propagation_table, travel_time
     from obsnet.pipeline import RunConfig
-    from obsnet.run import travel_time
 
     try:
         return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m))

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from obsnet.run import Run, track
 from obsnet.ais import ReferenceTrack, read, reference_tracks
 from obsnet.errors import ConfigError, ObsnetError
 from obsnet.evaluation import Evaluation, evaluate
 from obsnet.layout import to_posix
+from obsnet.run import Run, track
 from obsnet.signals.station import Station
 from obsnet.twin.course import WaypointCourse
 from obsnet.twin.instrument import Recorder
@@ -59,11 +59,21 @@ class Result:
 
     def to_json(self) -> dict[str, Any]:
         """Plain containers."""
-        return {"simulated_waveforms": True, "obsnet": self.obsnet.to_json(), "obsea": self.obsea, "paper": PAPER}
+        return {
+            "simulated_waveforms": True,
+            "obsnet": self.obsnet.to_json(),
+            "obsea": self.obsea,
+            "paper": PAPER,
+        }
 
     def table(self) -> str:
-        """obsnet's Table I, then the medians of all three."""
-        lines = ["Simulated waveforms on the real courses of 21-26 May 2013, station RR03", "", "obsnet:", self.obsnet.table()]
+        """Obsnet's Table I, then the medians of all three."""
+        lines = [
+            "Simulated waveforms on the real courses of 21-26 May 2013, station RR03",
+            "",
+            "obsnet:",
+            self.obsnet.table(),
+        ]
         if self.obsea is not None:
             lines += ["", f"obsea 0.1 on the same waveforms ({self.obsea['command']}):", self.obsea["table"]]
         lines += ["", "The paper's Table I (real waveforms):", _paper_table()]
@@ -75,7 +85,7 @@ class Result:
 
 
 def reproduce(
-    runs: int = 1, seed: int = 0, progress: Callable[[int, int], None] | None = None, jobs: int = 1
+    runs: int = 1, seed: int = 0, progress: Callable[[float, float], None] | None = None, jobs: int = 1
 ) -> Result:
     """Simulate the week, track it, evaluate it.
 
@@ -85,7 +95,9 @@ def reproduce(
     progress : called with (done, total). jobs : threads.
     """
     if runs != 1:
-        raise ConfigError(f"the week is one record, not a Monte Carlo experiment; asked for {runs} runs, leave --runs out")
+        raise ConfigError(
+            f"the week is one record, not a Monte Carlo experiment; asked for {runs} runs, leave --runs out"
+        )
     reference = ships()
     with tempfile.TemporaryDirectory(prefix="obsnet-table1-") as folder:
         simulate(Path(folder), reference, seed, progress and (lambda done, total: progress(done, 2 * total)))
@@ -95,7 +107,7 @@ def reproduce(
             station,
             threads=jobs,
             folder=Path(folder) / "run",
-            progress=progress and (lambda done, total: progress(int(total + done), int(2 * total))),
+            progress=progress and (lambda done, total: progress(total + done, 2 * total)),
         )
         run.maps.load()
         run.features.load()
@@ -121,13 +133,16 @@ def ships(max_range_m: float = 100e3) -> list[ReferenceTrack]:
 
 
 def simulate(
-    folder: Path, reference: list[ReferenceTrack], seed: int = 0, progress: Callable[[int, int], None] | None = None
+    folder: Path,
+    reference: list[ReferenceTrack],
+    seed: int = 0,
+    progress: Callable[[float, float], None] | None = None,
 ) -> None:
     """Write the week's simulated waveforms, StationXML, AIS and truth to a folder."""
     far = {(track.mmsi, round(track.cpa().time)): track for track in ships(AIS_REACH_M)}
     passages = []
-    for number, track in enumerate(reference, 1):
-        whole = far.get((track.mmsi, round(track.cpa().time)), track)
+    for number, ship in enumerate(reference, 1):
+        whole = far.get((ship.mmsi, round(ship.cpa().time)), ship)
         course = WaypointCourse(whole.time, whole.east_m, whole.north_m, smooth=False)
         passages.append(Passage(Ship.random(1000 * seed + number, 999_000_000 + number), course))
     scenario = Scenario(
@@ -135,7 +150,12 @@ def simulate(
         hours=HOURS,
         passages=tuple(passages),
         recorder=Recorder(
-            code="YV.RR03", latitude=LATITUDE, longitude=LONGITUDE, depth_m=DEPTH_M, orientation_deg=77.0, hydrophone_polarity=-1
+            code="YV.RR03",
+            latitude=LATITUDE,
+            longitude=LONGITUDE,
+            depth_m=DEPTH_M,
+            orientation_deg=77.0,
+            hydrophone_polarity=-1,
         ),
         ambient=Ambient.random(np.random.default_rng([seed, 0x7AB1E1])),
         seed=seed,
@@ -154,7 +174,12 @@ def kept_obsea(seed: int) -> dict[str, Any] | None:
 
 def _paper_table() -> str:
     names = ("#", "az N", "deg", "r N", "m", "kn", "CPA s", "course deg", "CPA m", "kn")
-    columns = [[*map(str, range(1, 12)), "All"], *([("-" if v is None else f"{v:g}") for v in column] for column in PAPER.values())]
+    columns = [
+        [*map(str, range(1, 12)), "All"],
+        *([("-" if v is None else f"{v:g}") for v in column] for column in PAPER.values()),
+    ]
     widths = [max(len(name), *map(len, column)) for name, column in zip(names, columns, strict=True)]
     rows = [names, *zip(*columns, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+    )

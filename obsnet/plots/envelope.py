@@ -13,11 +13,10 @@ from obsnet.ais import ReferenceTrack
 from obsnet.detectors.analytic import cepstral_model
 from obsnet.layout import to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import parse_pair, tdoa
+from obsnet.ocean.rays import parse_pair, tdoa, travel_time
 from obsnet.plots import style
 from obsnet.plots.overlay import heard
 from obsnet.plots.panels import longest_quefrency, squared_envelope, without
-from obsnet.ocean.rays import travel_time
 from obsnet.run import Run
 
 RANGE_STEP_M = 500.0

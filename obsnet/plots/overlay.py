@@ -15,8 +15,8 @@ from matplotlib.patheffects import withStroke
 
 from obsnet.ais import ReferenceTrack
 from obsnet.layout import to_posix
-from obsnet.plots import style
 from obsnet.ocean.rays import travel_time
+from obsnet.plots import style
 from obsnet.run import Run
 from obsnet.trackers.track import Track
 

@@ -118,8 +118,7 @@ class ClutterFilter:
             if self._is_due(step):
                 self._learn(step)
             end = self._next_instant(steps, values, done)
-            if self._learned is not None:
-                filtered[done:end] = self._project(values[done:end])
+            filtered[done:end] = self._project(values[done:end])
             self._remember(step, values[done:end])
             done = end
         return cepstra.copy(data=np.ascontiguousarray(filtered.T))
@@ -146,14 +145,20 @@ class ClutterFilter:
         if count < self.WARM_UP_FRAMES:
             self._learned = None
         elif self.config.clutter == "svd":
-            self._learned = leading_basis(sum(held.moment for held in self._steps.values()), count)
+            self._learned = leading_basis(self._moment(), count)
         else:
-            self._learned = sum(held.moment for held in self._steps.values()) / count
+            self._learned = self._moment() / count
+
+    def _moment(self) -> np.ndarray:
+        return np.sum([held.moment for held in self._steps.values()], axis=0)
 
     def _project(self, frames: np.ndarray) -> np.ndarray:
+        learned = self._learned
+        if learned is None:
+            return np.full_like(frames, np.nan)
         if self.config.clutter == "svd":
-            return frames - (frames @ self._learned) @ self._learned.T
-        return frames - self._learned.astype(frames.dtype)
+            return frames - (frames @ learned) @ learned.T
+        return frames - learned.astype(frames.dtype)
 
     def _remember(self, step: int, frames: np.ndarray) -> None:
         valid = frames[~np.isnan(frames[:, 0])].astype(float)

@@ -7,6 +7,7 @@ the ship when the sound left it (paper's eq. 26, the travel time undone). The se
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import gammaln
 
 from obsnet.errors import ConfigError
 from obsnet.kinematics import StraightCourse, wrap180
@@ -126,20 +128,28 @@ def search(
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
     tracks: list[Track] = []
     for number in range(config.max_ships):
-        track = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
+        found = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
         least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
-        if track is None or track.log_bayes_factor < least:
+        if found is None or found.log_bayes_factor < least:
             break
-        if finder.believable(track):
-            tracks.append(track)
-        azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
+        if finder.believable(found):
+            tracks.append(found)
+        azimuth_llr, range_llr = finder.without(found, azimuth_llr, range_llr)
     return tracks
 
 
 class _Finder:
     """The search over one segment's tiles."""
 
-    def __init__(self, maps, times, segment, delay, config, threads) -> None:
+    def __init__(
+        self,
+        maps: xr.Dataset,
+        times: np.ndarray,
+        segment: Segment,
+        delay: Callable[[np.ndarray], np.ndarray],
+        config: GridSearchConfig,
+        threads: int,
+    ) -> None:
         self.config, self.threads, self.segment = config, threads, segment
         self.origin = times[0]
         self.tiles = times - self.origin
@@ -211,7 +221,14 @@ class _Finder:
         t, i, j, q = np.unravel_index(values.argmax(), values.shape)
         return float(values[t, i, j, q]), np.array([cpa_time[t], cpa_range[i], course[q] % 360.0, speed[j]])
 
-    def _grid(self, cpa_time, cpa_range, speed, course, scores: _Scores) -> np.ndarray:
+    def _grid(
+        self,
+        cpa_time: np.ndarray,
+        cpa_range: np.ndarray,
+        speed: np.ndarray,
+        course: np.ndarray,
+        scores: _Scores,
+    ) -> np.ndarray:
         """Score of every hypothesis of a grid, (n_cpa_time, n_cpa_range, n_speed, n_course) float32."""
         offset, index = np.unique(np.round(self.tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
         index = index.reshape(len(cpa_time), len(self.tiles))
@@ -241,21 +258,24 @@ class _Finder:
 
     def _share(self, task: Callable, count: int) -> None:
         bounds = np.linspace(0, count, self.threads + 1).astype(int)
-        parts = [slice(lo, hi) for lo, hi in zip(bounds[:-1], bounds[1:], strict=True)]
+        parts = [slice(lo, hi) for lo, hi in itertools.pairwise(bounds)]
         if self.threads == 1:
             task(parts[0])
             return
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(task, parts))
 
-    def _score_points(self, points: np.ndarray, scores: _Scores, keep_tiles: bool = False):
+    def _score_points(
+        self, points: np.ndarray, scores: _Scores, keep_tiles: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Score of each hypothesis, and each tile's share of it where asked for."""
         out = np.empty(len(points))
         per_tile = np.zeros((len(self.tiles), len(points) if keep_tiles else 0))
         search_kernels.score_points(
             np.ascontiguousarray(points), self.tiles, self.delay, self.delay_step, scores.range_score, scores.geometry,
             scores.azimuth_score, scores.azimuth_step, scores.jointly, per_tile, out,
         )  # fmt: skip
-        return (out, per_tile) if keep_tiles else out
+        return out, per_tile
 
     def _posterior(self, best: np.ndarray, scores: _Scores) -> Track:
         """Mean, covariance and evidence by adaptive importance sampling around the best hypothesis."""
@@ -267,7 +287,7 @@ class _Finder:
         for _ in range(5):
             points, log_proposal = _student(rng, mean, cov, config.samples, seen)
             inside = self._inside(points)
-            log_target = np.where(inside, config.exponent * self._score_points(points, scores), -np.inf)
+            log_target = np.where(inside, config.exponent * self._score_points(points, scores)[0], -np.inf)
             log_weight = log_target - log_proposal
             top = log_weight.max()
             weight = np.exp(log_weight - top)
@@ -290,10 +310,11 @@ class _Finder:
         motion = StraightCourse(self.origin + mean[0], float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
         method = "grid search" if self.sees_course and self.sees_range else _blind(self.sees_course)
         start, end = self.origin + self.tiles[lo], self.origin + self.tiles[hi]
-        extra = {"score": float(score[0]), "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed)}
-        return Track(
-            float(start), float(end), motion, cov, log_bayes_factor, method, extra
-        )
+        extra = {
+            "score": float(score[0]),
+            "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
+        }
+        return Track(float(start), float(end), motion, cov, log_bayes_factor, method, extra)
 
     def _fixed_source(self, scores: _Scores, lo: int, hi: int) -> float:
         """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
@@ -316,7 +337,12 @@ class _Finder:
         within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
         long_enough = track.end - track.start >= config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
-        return long_enough and within_speed and within_range and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
+        return (
+            long_enough
+            and within_speed
+            and within_range
+            and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
+        )
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
@@ -329,7 +355,12 @@ class _Finder:
         )
 
     def _scores(
-        self, azimuth_llr, range_llr, jointly: bool, pool: int, stds: tuple[float, float, float]
+        self,
+        azimuth_llr: np.ndarray | None,
+        range_llr: np.ndarray | None,
+        jointly: bool,
+        pool: int,
+        stds: tuple[float, float, float],
     ) -> _Scores:
         """Score maps at one smoothing: range bins (of `pool` grid steps), azimuth [deg], range rate bins."""
         config = self.config
@@ -357,7 +388,9 @@ class _Finder:
         geometry = np.array([first, spacing, float(self.rate[0]), rate_step])
         return _Scores(range_score, geometry, azimuth_score, step, jointly)
 
-    def without(self, track: Track, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None):
+    def without(
+        self, track: Track, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The maps with what a track explains made silent, for the search of the next ship."""
         emitted = self.origin + self.tiles
         for _ in range(3):
@@ -378,7 +411,9 @@ class _Finder:
         return azimuth_llr, range_llr
 
 
-def _tiles(maps: xr.Dataset, segment: Segment, config: GridSearchConfig):
+def _tiles(
+    maps: xr.Dataset, segment: Segment, config: GridSearchConfig
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None] | None:
     """Tile times and the maps there, read from disk no further than that; none if there are fewer than three."""
     times = to_posix(maps["time"].values)
     inside = (times >= segment.start - 1e-6) & (times <= segment.end + 1e-6)
@@ -389,8 +424,11 @@ def _tiles(maps: xr.Dataset, segment: Segment, config: GridSearchConfig):
     strides = np.diff(chosen)
     regular = slice(chosen[0], chosen[-1] + 1, strides[0]) if (strides == strides[0]).all() else chosen
     part = maps.isel(time=regular)
-    llr = [part[name].values.astype(np.float32, copy=False) if name in maps else None for name in ("azimuth_llr", "range_llr")]
-    return times[chosen], *llr
+
+    def llr(name: str) -> np.ndarray | None:
+        return part[name].values.astype(np.float32, copy=False) if name in maps else None
+
+    return times[chosen], llr("azimuth_llr"), llr("range_llr")
 
 
 def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
@@ -410,14 +448,14 @@ def _mixed(ratio: np.ndarray, top: np.ndarray, probability: float) -> np.ndarray
 def _polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -> tuple[np.ndarray, float]:
     """Azimuth rows laid out so that the courses of one hypothesis are neighbours in memory."""
     if course_step < step:
-        finer = int(round(step / course_step))
+        finer = round(step / course_step)
         count = rows.shape[1]
         position = np.arange(count * finer) / finer
         low = np.floor(position).astype(int)
         mu = (position - low).astype(np.float32)
         rows = (1 - mu) * rows[:, low] + mu * rows[:, (low + 1) % count]
         step = step / finer
-    phases = max(1, int(round(course_step / step)))
+    phases = max(1, round(course_step / step))
     bins = rows.shape[1]
     if bins % phases:
         phases = 1 if courses == 1 else phases
@@ -434,7 +472,7 @@ def _student(
     count: int,
     seen: np.ndarray,
     dof: float = 5.0,
-):
+) -> tuple[np.ndarray, np.ndarray]:
     """Draws from a multivariate t over the parameters that are seen, and the log density of each."""
     d = int(seen.sum())
     root = np.linalg.cholesky(cov[np.ix_(seen, seen)] * 1.5)
@@ -442,8 +480,6 @@ def _student(
     points = np.tile(mean, (count, 1))
     points[:, seen] += z @ root.T
     points[:, 2] %= 360.0
-    from scipy.special import gammaln
-
     constant = (
         gammaln((dof + d) / 2)
         - gammaln(dof / 2)

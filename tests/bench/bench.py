@@ -49,7 +49,19 @@ def import_ratio(repeat: int = 15) -> float:
 
 
 def record(folder: Path, hours: float) -> None:
-    command = [sys.executable, "-m", "obsnet", "simulate", "--out", str(folder), "--hours", str(hours), "--seed", "7", "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "obsnet",
+        "simulate",
+        "--out",
+        str(folder),
+        "--hours",
+        str(hours),
+        "--seed",
+        "7",
+        "--quiet",
+    ]
     subprocess.run(command, check=True)
 
 
@@ -60,25 +72,41 @@ def track(folder: Path, repeat: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", type=float, default=8.0)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--no-obsea", action="store_true")
     parser.add_argument("--no-day", action="store_true")
     arguments = parser.parse_args()
-    print(f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, simulated waveforms, four channels at 50 Hz")
+    print(
+        f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, simulated waveforms, four channels at 50 Hz"
+    )
     print(f"import obsnet / import numpy: {import_ratio():.1f}")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "short"
         record(folder, arguments.hours)
         wall, peak = track(folder, arguments.repeat)
         stages = json.loads((folder / "out" / "run.json").read_text())["seconds"]
-        print(f"obsnet track, whole process, {arguments.hours:g} h: {wall:.2f} s, {peak:.0f} MB; stages {stages}")
+        print(
+            f"obsnet track, whole process, {arguments.hours:g} h: {wall:.2f} s, {peak:.0f} MB; stages {stages}"
+        )
         if not arguments.no_obsea:
-            command = [sys.executable, str(HERE / "obsea_stages.py"), str(folder), "--out", str(folder / "obsea")]
-            seconds = json.loads(subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).splitlines()[-1])
-            theirs = sum(seconds[name] for name in ("azimuth", "clutter", "range", "track") if name in seconds)
-            print(f"obsea, its stages: {theirs:.1f} s {({k: round(v, 1) for k, v in seconds.items()})}")
+            command = [
+                sys.executable,
+                str(HERE / "obsea_stages.py"),
+                str(folder),
+                "--out",
+                str(folder / "obsea"),
+            ]
+            seconds = json.loads(
+                subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).splitlines()[-1]
+            )
+            theirs = sum(
+                seconds[name] for name in ("azimuth", "clutter", "range", "track") if name in seconds
+            )
+            print(f"obsea, its stages: {theirs:.1f} s { ({k: round(v, 1) for k, v in seconds.items()}) }")
             children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
             print(f"obsea / obsnet: {theirs / wall:.0f} times (obsea's peak memory {children:.0f} MB)")
         if not arguments.no_day:

@@ -51,7 +51,11 @@ def run(folder: Path, out: Path, tracking: bool = True) -> dict[str, float]:
     pulses = cepstral_model(quefrency, table, Amplitudes.table_ii().scaled_to(station.depth_m), config)
     delays = np.stack([tdoa(table, pair).interp(range=config.range_m).values for pair in config.pairs])
     model = obsea.build_model(
-        xr.DataArray(pulses), xr.DataArray(noise_std(quefrency, 1024)), xr.DataArray(delays), config.pulse_width_s, 50.0
+        xr.DataArray(pulses),
+        xr.DataArray(noise_std(quefrency, 1024)),
+        xr.DataArray(delays),
+        config.pulse_width_s,
+        50.0,
     )
     days = _days(folder)
     pressure, phasors = [], []
@@ -89,7 +93,8 @@ def run(folder: Path, out: Path, tracking: bool = True) -> dict[str, float]:
     tracks = []
     if tracking:
         ell_a, ell_r = (
-            ell.assign_coords(time=np.rint(1e9 * ell["time"].values).astype("datetime64[ns]")) for ell in (ell_a, ell_r)
+            ell.assign_coords(time=np.rint(1e9 * ell["time"].values).astype("datetime64[ns]"))
+            for ell in (ell_a, ell_r)
         )
         tracks = _track(obsea_tracking, ell_a, ell_r, xr)
         lap("track")
@@ -124,7 +129,10 @@ def _write_detections(path: Path, minutes, ell_a, ell_r, pd) -> None:
     seen_r = np.log(ell_r.mean(["distance", "speed"]).values)
     azimuth = ell_a["azimuth"].values[ell_a.argmax("azimuth").values] % 360
     best = ell_r.argmax(["distance", "speed"])
-    distance, rate = ell_r["distance"].values[best["distance"].values], ell_r["speed"].values[best["speed"].values]
+    distance, rate = (
+        ell_r["distance"].values[best["distance"].values],
+        ell_r["speed"].values[best["speed"].values],
+    )
     table = {
         "time": pd.to_datetime(minutes, unit="s").strftime("%Y-%m-%dT%H:%M:%SZ"),
         "coverage": 1.0,
@@ -147,7 +155,10 @@ def _track(obsea, ell_a, ell_r, xr) -> list[list]:
     ell["all"] = ell["r"] * ell["a"]
     p = {k: obsea.ell2proba(obsea.segment(v, width[k[0]])) for k, v in ell.items()}
     heard = p["all"] > 0.5
-    closing, opening = heard & (p["r"] > 0.5) & (p["rm"] > p["rp"]), heard & (p["r"] > 0.5) & (p["rm"] < p["rp"])
+    closing, opening = (
+        heard & (p["r"] > 0.5) & (p["rm"] > p["rp"]),
+        heard & (p["r"] > 0.5) & (p["rm"] < p["rp"]),
+    )
     try:
         segments = obsea.delimit({"vm": closing, "vp": opening, "all": heard})
     except IndexError as error:
@@ -163,7 +174,18 @@ def _track(obsea, ell_a, ell_r, xr) -> list[list]:
         course = float(np.rad2deg(a) % 360)
         stamp = [str(np.datetime_as_string(x.astype("datetime64[s]"))) + "Z" for x in (start, end)]
         when = str(np.datetime_as_string(np.datetime64(int(t), "s"))) + "Z"
-        rows.append([len(rows) + 1, *stamp, when, abs(r), (course + (-90 if r >= 0 else 90)) % 360, course, v, *[np.nan] * 5])
+        rows.append(
+            [
+                len(rows) + 1,
+                *stamp,
+                when,
+                abs(r),
+                (course + (-90 if r >= 0 else 90)) % 360,
+                course,
+                v,
+                *[np.nan] * 5,
+            ]
+        )
     return rows
 
 
@@ -177,9 +199,24 @@ def _search(obsea, ell_a, ell_r, start, cpa, end, xr):
     ten, one = np.deg2rad(10), np.deg2rad(1)
     t, r, a, v = posix[1], 0.0, 0.0, 9.5
     levels = [
-        (np.arange(-1800, 1801, 180), np.arange(-50_000, 51_000, 1000), np.arange(0, 2 * np.pi, ten), np.arange(-3.5, 3.6, 0.5)),
-        (np.arange(-180, 181, 10), np.arange(-1000, 1001, 100), np.arange(-ten, ten + one, one), np.arange(-0.5, 0.51, 0.1)),
-        (np.arange(-10, 11, 1), np.arange(-100, 101, 10), np.arange(-one, 1.1 * one, one / 10), np.arange(-0.1, 0.11, 0.01)),
+        (
+            np.arange(-1800, 1801, 180),
+            np.arange(-50_000, 51_000, 1000),
+            np.arange(0, 2 * np.pi, ten),
+            np.arange(-3.5, 3.6, 0.5),
+        ),
+        (
+            np.arange(-180, 181, 10),
+            np.arange(-1000, 1001, 100),
+            np.arange(-ten, ten + one, one),
+            np.arange(-0.5, 0.51, 0.1),
+        ),
+        (
+            np.arange(-10, 11, 1),
+            np.arange(-100, 101, 10),
+            np.arange(-one, 1.1 * one, one / 10),
+            np.arange(-0.1, 0.11, 0.01),
+        ),
     ]
     for dt, dr, da, dv in levels:
         index, _ = search(t + dt, r + dr.astype(float), (a + da) % (2 * np.pi), v + dv)

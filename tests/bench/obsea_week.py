@@ -1,6 +1,6 @@
 """Run `obsea` on the simulated test week of `obsnet reproduce table1` and keep its Table I (takes about half an hour).
 
-    python tests/bench/obsea_week.py --seed 0
+python tests/bench/obsea_week.py --seed 0
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ def test_gap_costs_coverage_not_zeros():
 
 
 def test_window_that_a_product_cannot_hold_is_refused():
-    azigram, times = random_azigram(np.random.default_rng(8), frames=400)
+    azigram, _times = random_azigram(np.random.default_rng(8), frames=400)
     detector = AnalyticAzimuthDetector(AzimuthDetectorConfig(window_s=3600.0, mean_resultant_length=0.999))
     with pytest.raises(ConfigError, match="shorten the window"):
         detector.maps(azigram, np.array([T0 + 1800.0]))

@@ -113,7 +113,10 @@ def test_real_ship_lies_where_its_operator_heard_it():
                 name: (("frequency", "time"), values.astype(np.complex64))
                 for name, values in (("p", -p), ("east", east), ("north", north))
             },
-            coords={"frequency": np.arange(513) * rate / 1024, "time": from_posix(np.arange(p.shape[1]) * 512 / rate)},
+            coords={
+                "frequency": np.arange(513) * rate / 1024,
+                "time": from_posix(np.arange(p.shape[1]) * 512 / rate),
+            },
         )
         phasors.append(azigram(array, AzigramConfig(fmin_hz=1000.0, fmax_hz=1250.0)).values)
     measured = np.angle(np.concatenate(phasors, axis=1))[..., None]

@@ -59,7 +59,8 @@ SEGMENT = Segment(MINUTES[0], MINUTES[-1], T0 + 7200.0)
 
 
 @pytest.mark.parametrize(
-    ("cpa_range", "course"), [(10_000.0, 5.0), (-10_000.0, 122.0), (4_000.0, 122.0), (-25_000.0, 5.0), (9_000.0, 263.0)]
+    ("cpa_range", "course"),
+    [(10_000.0, 5.0), (-10_000.0, 122.0), (4_000.0, 122.0), (-25_000.0, 5.0), (9_000.0, 263.0)],
 )
 def test_known_course_comes_back_on_its_side(cpa_range, course):
     truth = StraightCourse(T0 + 7000.0, cpa_range, course, 8.3)
