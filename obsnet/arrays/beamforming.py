@@ -15,9 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import fft
 
 from obsnet.arrays.whitening import NoiseModel
 from obsnet.errors import ConfigError, WaveformError
+
+BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -183,25 +186,34 @@ class Beamformer:
             raise WaveformError(
                 f"batches must have dims (batch, {wanted[0]}, {wanted[1]}), found {batches.shape}"
             )
-        spectrum = odd_spectrum(np.swapaxes(batches, 1, 2)).astype(np.complex64)
+        power = np.empty((len(batches), len(self.azimuth_deg)), np.float32)
+        for start in range(0, len(batches), BLOCK):
+            power[start : start + BLOCK] = self._power(batches[start : start + BLOCK])
+        return power
+
+    def _power(self, batches: np.ndarray) -> np.ndarray:
+        spectrum = odd_spectrum(np.swapaxes(batches, 1, 2).astype(np.float32, order="C"))
         power = np.zeros((len(self.azimuth_deg), len(batches)), np.float32)
         for weights, values in zip(
             self._weights, np.ascontiguousarray(spectrum.transpose(2, 1, 0)), strict=True
         ):
-            beam = weights @ values
-            power += beam.real**2 + beam.imag**2
+            squares = (weights @ values).view(np.float32)
+            np.square(squares, out=squares)
+            power += squares[:, ::2]
+            power += squares[:, 1::2]
         return 2.0 * power.T
 
 
 def odd_spectrum(signal: np.ndarray) -> np.ndarray:
-    """Unitary discrete Fourier transform at the frequencies (n + 1/2)/N, n < N/2, along the last axis (N
-    even).
+    """Unitary discrete Fourier transform at the frequencies (n + 1/2)/N, n < N/2, along the last axis.
 
-    Energy: Σ x² = 2 Σ |X|².
+    N is even. Energy: Σ x² = 2 Σ |X|².
     """
     count = signal.shape[-1]
-    shifted = signal * np.exp(-1j * np.pi * np.arange(count) / count)
-    return np.fft.fft(shifted, axis=-1)[..., : count // 2] / np.sqrt(count)
+    signal = np.asarray(signal)
+    twist = np.exp(-1j * np.pi * np.arange(count) / count)
+    shifted = signal * twist.astype(np.result_type(signal.dtype, np.complex64))
+    return fft.fft(shifted, axis=-1)[..., : count // 2] / count**0.5
 
 
 def odd_signal(spectrum: np.ndarray) -> np.ndarray:
@@ -209,8 +221,5 @@ def odd_signal(spectrum: np.ndarray) -> np.ndarray:
     half = spectrum.shape[-1]
     count = 2 * half
     padded = np.concatenate([spectrum, np.zeros_like(spectrum)], axis=-1)
-    return (
-        2.0
-        * np.sqrt(count)
-        * (np.fft.ifft(padded, axis=-1) * np.exp(1j * np.pi * np.arange(count) / count)).real
-    )
+    twist = np.exp(1j * np.pi * np.arange(count) / count)
+    return 2.0 * count**0.5 * (fft.ifft(padded, axis=-1) * twist).real

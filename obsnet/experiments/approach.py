@@ -122,6 +122,20 @@ class Approach:
         nothing = np.full(len(time), np.nan)
         return Truth(time, nothing, nothing, nothing)
 
+    def whitened_snr_db(self, truth: Truth, noise: NoiseModel) -> np.ndarray:
+        """SNR after the noise is white: 10 log10 of η |E e eᵀ|^{1/M} times the mean of ‖g(ψ, f)‖²/M over f.
+
+        g = Σ^−½ A(f) h(ψ, f) is what whitening leaves of the wave's phases: more where the sea is quiet.
+        """
+        beams = self.beamformer()
+        transfer = noise.transfer((beams.frequency_hz - beams.carrier_hz) / beams.sampling_rate)
+        there = truth.present
+        white = np.einsum("fij,bjf->bif", transfer, beams.phases(truth.azimuth_deg[there]))
+        gain = self._level(noise) * (np.abs(white) ** 2).sum(axis=1).mean(axis=1) / self.hydrophones
+        snr = truth.snr_db.copy()
+        snr[there] += 10.0 * np.log10(gain)
+        return snr
+
     def simulate(self, truth: Truth, noise: NoiseModel, rng: np.random.Generator) -> np.ndarray:
         """Simulated samples, dims (batch, N, hydrophone): the paper's algorithm 1.
 
@@ -131,9 +145,11 @@ class Approach:
         batches = len(truth.time_s)
         samples = noise.simulate(batches * self.nperseg, rng).reshape(batches, self.nperseg, -1)
         there = truth.present
-        level = np.exp(np.linalg.slogdet(noise.autocovariance())[1] / self.hydrophones)
-        amplitude = np.sqrt(level * 10.0 ** (truth.snr_db[there] / 10.0))
+        amplitude = np.sqrt(self._level(noise) * 10.0 ** (truth.snr_db[there] / 10.0))
         source = amplitude[:, None] * rng.standard_normal((there.sum(), self.nperseg))
         samples[there] += self.beamformer().delay(source, truth.azimuth_deg[there])
         nu = self.degrees_of_freedom
         return samples * np.sqrt(nu / rng.chisquare(nu, batches))[:, None, None]
+
+    def _level(self, noise: NoiseModel) -> float:
+        return float(np.exp(np.linalg.slogdet(noise.autocovariance())[1] / self.hydrophones))

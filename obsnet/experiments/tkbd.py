@@ -3,9 +3,16 @@
 Source: Bossér et al., Broadband passive sonar track-before-detect using raw acoustic data, section V.
 
 Everything is simulated. What the paper's table leaves unreadable is chosen here: p_s = 0.9999 and p_b =
-1e-5 per batch of 0.17 s, SNR drift 0.5 dB/s, births uniform over 5 dB of SNR. The trackers' noise models
-are fitted by least squares to a target-free record, as a listener must, where the paper hands them the
-truth.
+1e-5 per batch of 0.17 s, SNR drift 0.5 dB/s, births uniform over 5 dB of SNR, P_d = 0.7 and 3° for
+detections. The trackers' noise models are fitted by least squares to a target-free record, as a listener
+must, where the paper hands them the truth.
+
+Why TVAR14 gains more here than the paper's 4 dB. A batch of white noise and a target with M η = 0.13 (−18
+dB) holds (N/2)(x − ln(1 + x)) at x = M η, a quarter of a nat; six batches a second confirm it within half a
+minute, whatever tracker multiplies them up, if it lets targets be born so weak. With heavy tails in its
+likelihood TVAR14 may do so without a false track, and confirms as soon as the approach begins. Births at −5
+to 0 dB instead of −20 to −15 delay it to −15 dB, at 0 to 5 dB to −5 dB: the paper's −9 dB lies between.
+TVAR0 and CFAR take the sea's own sectors for targets until their settings keep both out.
 """
 
 from __future__ import annotations
@@ -191,6 +198,7 @@ def reproduce(
         tuple(outcomes),
         power,
         approach.beamformer().azimuth_deg,
+        approach.whitened_snr_db(truth, listener.noise),
         akaike,
         time.monotonic() - began,
     )

@@ -17,7 +17,7 @@ CUTOFF_DEG = 30.0
 ON_TARGET_DEG = 10.0
 TRACK_S = 1.0
 
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#000000")
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (3, 2)))
 PAPER_SNR_DB = {"TVAR14": -9.0, "TVAR0": -5.0, "GVAR14": -8.0, "CFAR": -5.0, "CFARVAR14": -5.0}
 
@@ -99,6 +99,8 @@ class Result:
     outcomes : tuple, one per run, of dicts by tracker
     power : array, dims (batch, azimuth)
         Raw beam power of the first run, for the figure.
+    whitened_snr_db : array, dims (batch,)
+        True SNR after whitening: what trackers of whitened samples estimate.
     akaike_order : int
         Order of the noise model that Akaike's criterion chooses on target-free samples.
     elapsed_s : float
@@ -110,6 +112,7 @@ class Result:
     outcomes: tuple[dict[str, Outcome], ...]
     power: np.ndarray
     azimuth_deg: np.ndarray
+    whitened_snr_db: np.ndarray
     akaike_order: int
     elapsed_s: float
 
@@ -156,8 +159,12 @@ class Result:
         return _median(self.values(tracker, "azimuth_rmse_deg"))
 
     def snr_bias_db(self, tracker: str) -> float | None:
-        """Estimated minus true SNR while on target, median [dB]; None for trackers of detections."""
-        return _median(self.values(tracker, "snr_db") - self.truth.snr_db)
+        """Estimated minus true SNR, both after whitening, while on target; median [dB].
+
+        None for trackers of detections, which do not know it; of little meaning for TVAR0, whose whitening is
+        another.
+        """
+        return _median(self.values(tracker, "snr_db") - self.whitened_snr_db)
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers; keys `snr_at_confirmation_db`, `gain_db`, `false_tracks` and more."""
@@ -239,7 +246,10 @@ class Result:
             low, high = np.quantile(existence, [0.1, 0.9], axis=0)
             axes[3].fill_between(time_s, low, high, color=style["color"], alpha=0.12, lw=0)
         axes[1].set(ylabel="OSPA [deg]", ylim=(0, CUTOFF_DEG + 1))
-        axes[2].plot(time_s, truth.snr_db, color="black", lw=1.0, label="true")
+        axes[2].plot(time_s, truth.snr_db, color="black", lw=1.0, label="true, at a hydrophone")
+        axes[2].plot(
+            time_s, self.whitened_snr_db, color="0.5", lw=2.5, label="true, after whitening", zorder=0
+        )
         axes[2].set(ylabel="SNR [dB]")
         axes[2].legend(loc="upper left", frameon=False)
         axes[3].axhline(CONFIRMED, color="black", lw=0.8, ls=":")

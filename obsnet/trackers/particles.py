@@ -37,10 +37,9 @@ def normalise(log_weights: np.ndarray, what: str = "particle") -> tuple[np.ndarr
     log_weights = np.asarray(log_weights, float)
     if log_weights.size == 0:
         raise FilterError(f"asked to normalise the weights of no {what} at all; give the filter at least one")
-    peak = log_weights.max()
-    if not np.isfinite(peak):
-        raise FilterError(_death(log_weights, peak, what))
-    total = float(peak + np.log(np.exp(log_weights - peak).sum()))
+    total = _log_total(log_weights.ravel())
+    if not np.isfinite(total):
+        raise FilterError(_death(log_weights, total, what))
     return log_weights - total, total
 
 
@@ -116,17 +115,34 @@ def circular_mean(angles_deg: np.ndarray, log_weights: np.ndarray) -> tuple[floa
     return mean, float(spread)
 
 
-def _death(log_weights: np.ndarray, peak: float, what: str) -> str:
+def _death(log_weights: np.ndarray, total: float, what: str) -> str:
     count = log_weights.size
-    if np.isnan(peak):
+    if np.isnan(log_weights).any():
         broken = int(np.isnan(log_weights).sum())
         return f"{broken} of {count} {what} weights are NaN; check the measurement for gaps"
-    if peak > 0:
+    if total > 0:
         return f"a {what} weight is infinite; give the measurement noise a positive spread"
     return (
         f"all {count} {what} weights are zero: the measurement contradicts every {what}; "
         "widen the prior or the measurement noise, or check the measurement"
     )
+
+
+@njit(cache=True, nogil=True)
+def _log_total(log_weights):
+    """NaN where a weight is, infinite where one is infinite or all are zero."""
+    peak = -np.inf
+    for weight in log_weights:
+        if np.isnan(weight):
+            return weight
+        if weight > peak:
+            peak = weight
+    if np.isinf(peak):
+        return peak
+    total = 0.0
+    for weight in log_weights:
+        total += np.exp(weight - peak)
+    return peak + np.log(total)
 
 
 @njit(cache=True, nogil=True)

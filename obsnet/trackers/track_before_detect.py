@@ -107,14 +107,12 @@ class BearingTracker:
 
     def _births(self) -> np.ndarray:
         config, count = self.config, self.config.bernoulli.births
-        share = (np.arange(count) + self._rng.random(count)) / count
-        return np.stack(
-            [
-                config.min_azimuth_deg + (config.max_azimuth_deg - config.min_azimuth_deg) * share,
-                config.rate_std_deg_s * self._rng.standard_normal(count),
-                self._rng.uniform(config.min_snr_db, config.max_snr_db, count),
-            ]
-        )
+        width = config.max_azimuth_deg - config.min_azimuth_deg
+        births = np.empty((3, count))
+        births[0] = config.min_azimuth_deg + width / count * (np.arange(count) + self._rng.random(count))
+        births[1] = config.rate_std_deg_s * self._rng.standard_normal(count)
+        births[2] = self._rng.uniform(config.min_snr_db, config.max_snr_db, count)
+        return births
 
 
 def track(
