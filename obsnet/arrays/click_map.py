@@ -46,6 +46,7 @@ def azimuth_map(
     azimuth: np.ndarray | None = None,
     config: ClickMapConfig | None = None,
     span: tuple[float, float] | None = None,
+    gaps: np.ndarray | None = None,
 ) -> xr.Dataset:
     """Log-likelihood ratio of an animal clicking at each azimuth against clutter alone.
 
@@ -65,6 +66,7 @@ def azimuth_map(
     times : centres of the windows, datetime64 or s since 1970.
     azimuth : grid, deg; every degree by default.
     span : start and end of the recording, s since 1970, for the coverage; unknown it counts as complete.
+    gaps : array (gap, (start, end)), s since 1970, within the recording.
 
     Returns
     -------
@@ -91,7 +93,7 @@ def azimuth_map(
     known = np.isfinite(bearing) & np.isfinite(spread)
     order = np.flatnonzero(known)[np.argsort(heard[known], kind="stable")]
     heard, ratio = heard[order], _wrapped_ratio(bearing[order], np.minimum(spread[order], 180.0), grid)
-    coverage = np.ones(len(centre)) if span is None else _coverage(centre, config.window_s, span)
+    coverage = np.ones(len(centre)) if span is None else _coverage(centre, config.window_s, span, gaps)
     first = np.searchsorted(heard, centre - config.window_s / 2.0)
     last = np.searchsorted(heard, centre + config.window_s / 2.0)
     rates = np.asarray(config.click_rates_hz)
@@ -123,7 +125,16 @@ def _wrapped_ratio(bearing: np.ndarray, spread: np.ndarray, grid: np.ndarray) ->
     return 360.0 * np.exp(-0.5 * squared).sum(axis=-1) / (np.sqrt(2.0 * np.pi) * spread[:, None])
 
 
-def _coverage(centre: np.ndarray, window_s: float, span: tuple[float, float]) -> np.ndarray:
-    begin = np.maximum(centre - window_s / 2.0, span[0])
-    end = np.minimum(centre + window_s / 2.0, span[1])
-    return np.clip((end - begin) / window_s, 0.0, 1.0)
+def _coverage(
+    centre: np.ndarray, window_s: float, span: tuple[float, float], gaps: np.ndarray | None
+) -> np.ndarray:
+    """Share of each window that was recorded."""
+    recorded = _overlap(centre, window_s, *span)
+    for begin, end in np.zeros((0, 2)) if gaps is None else gaps:
+        recorded = recorded - _overlap(centre, window_s, max(begin, span[0]), min(end, span[1]))
+    return np.clip(recorded / window_s, 0.0, 1.0)
+
+
+def _overlap(centre: np.ndarray, window_s: float, begin: float, end: float) -> np.ndarray:
+    first, last = np.maximum(centre - window_s / 2.0, begin), np.minimum(centre + window_s / 2.0, end)
+    return np.maximum(last - first, 0.0)

@@ -90,7 +90,8 @@ class ClickRecord:
     Attributes
     ----------
     array : CompactArray; pairs : int array (pair, 2), hydrophones counted from 0.
-    start, end : of the recording, s since 1970.
+    start, end : of the recording, s since 1970. gaps : array (gap, (start, end)) without samples, s since
+        1970.
     time : array (click,), arrival at the array's centre, s since 1970.
     tdoa, coefficient : arrays (click, pair), t_i − t_j in s and correlation coefficient.
     tdoa_covariance : array (click, pair, pair), s².
@@ -103,6 +104,7 @@ class ClickRecord:
     pairs: np.ndarray
     start: float
     end: float
+    gaps: np.ndarray
     time: np.ndarray
     tdoa: np.ndarray
     coefficient: np.ndarray
@@ -141,7 +143,8 @@ class ClickRecord:
         self, times: np.ndarray, azimuth: np.ndarray | None = None, config: ClickMapConfig | None = None
     ) -> xr.Dataset:
         """Azimuth map of the direct clicks, see `click_map.azimuth_map`."""
-        return azimuth_map(self.frame()[self.direct], times, azimuth, config, (self.start, self.end))
+        span = (self.start, self.end)
+        return azimuth_map(self.frame()[self.direct], times, azimuth, config, span, self.gaps)
 
 
 def process(
@@ -193,6 +196,7 @@ def process(
         pairs=pairs,
         start=starttime,
         end=starttime + recording.duration_s,
+        gaps=starttime + recording.gaps(),
         time=time + starttime,
         tdoa=tdoa,
         coefficient=np.array([click.coefficient for click in clicks]).reshape(-1, size),

@@ -12,6 +12,8 @@ from scipy.io import wavfile
 
 from obsnet.errors import WaveformError
 
+BLOCK = 1_000_000
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -126,6 +128,22 @@ class Recording:
         after = stop - start - before - len(scaled)
         return np.pad(scaled, ((before, after), (0, 0))).T if before or after else scaled.T
 
+    def gaps(self) -> np.ndarray:
+        """Stretches in which a hydrophone has no number, dims (gap, (start, end)), s; integer formats have
+        none.
+        """
+        if not np.issubdtype(self.raw.dtype, np.floating):
+            return np.zeros((0, 2))
+        edges: list[int] = []
+        missing = False
+        for first in range(0, self.length, BLOCK):
+            bad = ~np.isfinite(self.raw[first : first + BLOCK]).all(axis=1)
+            steps = np.flatnonzero(np.diff(np.concatenate([[missing], bad]).astype(np.int8)))
+            edges += (first + steps).tolist()
+            missing = bool(bad[-1])
+        edges += [self.length] if missing else []
+        return np.array(edges, float).reshape(-1, 2) / self.sampling_rate
+
 
 def read_wav(path: str | Path) -> tuple[float, np.ndarray]:
     """Sampling rate [Hz] and samples of a multichannel WAV file.
@@ -152,4 +170,16 @@ def _read(path: Path) -> tuple[int, np.ndarray]:
         except ValueError as error:
             if "container size" not in str(error):
                 raise
+        _refuse_short(path)
         return wavfile.read(path)
+
+
+def _refuse_short(path: Path) -> None:
+    """Refuse a file shorter than its header says; scipy sees that only where it maps the file."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    order = ">" if head[:4] == b"RIFX" else "<"
+    declared = struct.unpack(order + "I", head[4:8])[0] + 8
+    found = path.stat().st_size
+    if head[:4] in (b"RIFF", b"RIFX") and declared > found:
+        raise ValueError(f"its header says {declared} bytes, it holds {found}")
