@@ -14,6 +14,8 @@ from numba import njit
 
 from obsnet.errors import ConfigError, WaveformError
 
+BLOCK = 2048
+
 
 @dataclass(frozen=True)
 class NoiseModel:
@@ -249,8 +251,13 @@ def _triangle(samples: np.ndarray, order: int) -> tuple[np.ndarray, int]:
             f"a VAR({order}) of {channels} channels needs over {(order + 1) * channels + order} samples, "
             f"found {count}"
         )
-    columns = [samples[order - lag : count - lag] for lag in [*range(1, order + 1), 0]]
-    return np.asarray(np.linalg.qr(np.concatenate(columns, axis=1), mode="r")), used
+    triangle = np.zeros((0, (order + 1) * channels))
+    for first in range(order, count, BLOCK):
+        last = min(first + BLOCK, count)
+        columns = [samples[first - lag : last - lag] for lag in [*range(1, order + 1), 0]]
+        stacked = np.concatenate([triangle, np.concatenate(columns, axis=1)])
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+    return triangle, used
 
 
 def _innovation_covariance(triangle: np.ndarray, used: int, order: int, channels: int) -> np.ndarray:

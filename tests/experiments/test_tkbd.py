@@ -62,6 +62,22 @@ def test_the_target_adds_power_at_its_azimuth():
     assert beams.azimuth_deg[gain.argmax()] == pytest.approx(np.nanmean(truth.azimuth_deg), abs=4.0)
 
 
+def test_whitening_raises_the_snr_away_from_the_sea_and_lowers_it_in_its_direction():
+    approach = Approach()
+    noise = approach.noise()
+    azimuth = np.array([-55.0, -20.0])
+    truth = replace(approach.target_free(0.5), azimuth_deg=azimuth, snr_db=np.zeros(2))
+    snr = approach.whitened_snr_db(truth, noise)
+    beams = approach.beamformer()
+    transfer = noise.transfer((beams.frequency_hz - 750.0) / 375.0)
+    level = np.linalg.det(noise.autocovariance()) ** (1 / 8)
+    for found, here in zip(snr, azimuth, strict=True):
+        waves = beams.phases(here)
+        gain = [np.linalg.norm(t @ waves[:, f]) ** 2 / 8 for f, t in enumerate(transfer)]
+        assert found == pytest.approx(10 * np.log10(level * np.mean(gain)))
+    assert snr[0] > 2.0 and snr[1] < -1.0
+
+
 def test_the_single_target_metric_is_ospa():
     truth = np.array([np.nan, np.nan, 10.0, 10.0, 10.0])
     azimuth = np.array([0.0, 5.0, 12.0, 80.0, 10.0])
@@ -147,7 +163,7 @@ def test_calibration_finds_the_most_sensitive_quiet_setting(monkeypatch):
     contenders = (CONTENDERS["TVAR14"], CONTENDERS["GVAR14"])
     found = tkbd.calibrate(seed=5, hours=30.0 / 3600.0, contenders=contenders)
     assert found["TVAR14"] == -20.0, "heavy tails are in its likelihood"
-    assert found["GVAR14"] > -15.0, "heavy tails look like a target to a Gaussian"
+    assert found["GVAR14"] > found["TVAR14"], "heavy tails look like a target to a Gaussian"
 
 
 def test_bad_requests_are_refused():
