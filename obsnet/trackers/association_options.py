@@ -63,7 +63,7 @@ def offer(scan: Scan, model: ObservationModel, forecast: Forecast, gate_std: flo
         member[row, list(taken)] = True
         values[row, scan.channel[list(taken)]] = scan.value[list(taken)]
     prior = _prior(scan, model, member)
-    updated, narrowed, likelihood = _updates(model, forecast, values, noise)
+    updated, narrowed, likelihood = _updates(model, forecast, values, noise, gate_std)
     size = 2 * model.dimensions
     rest = len(found) - len(complete)
     unborn = np.full(rest, -np.inf)
@@ -96,36 +96,45 @@ def _prior(scan: Scan, model: ObservationModel, member: np.ndarray) -> np.ndarra
 
 
 def _updates(
-    model: ObservationModel, forecast: Forecast, values: np.ndarray, noise: np.ndarray
+    model: ObservationModel, forecast: Forecast, values: np.ndarray, noise: np.ndarray, gate_std: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every track updated by every combination: states and log likelihood, dims (track, combination, ...)."""
+    """Every track updated by every combination: states and log likelihood, dims (track, combination, ...).
+
+    A combination with a measurement outside the track's gate is impossible.
+    """
     predicted, jacobian = model.observe(forecast.mean)
     innovation = model.innovation(values[None], predicted[:, None])
     shape = (len(forecast.mean), len(values))
-    return update(
+    updated, narrowed, likelihood = update(
         np.broadcast_to(forecast.mean[:, None], (*shape, forecast.mean.shape[-1])),
         forecast.covariance[:, None],
         innovation,
         np.broadcast_to(jacobian[:, None], (*shape, *jacobian.shape[1:])),
         noise,
     )
+    outside = innovation**2 > gate_std**2 * _variances(jacobian, forecast, noise)[:, None]
+    return updated, narrowed, np.where(outside.any(axis=-1), -np.inf, likelihood)
+
+
+def _variances(jacobian: np.ndarray, forecast: Forecast, noise: np.ndarray) -> np.ndarray:
+    """Variance of each channel's innovation, dims (track, channel)."""
+    return np.einsum("upi,uij,upj->up", jacobian, forecast.covariance, jacobian) + np.diag(noise)
 
 
 def _gated(
     scan: Scan, model: ObservationModel, forecast: Forecast, noise: np.ndarray, gate_std: float, branches: int
 ) -> list[tuple[int, ...]]:
-    """For each track the best combinations of the measurements in its gate, by their factors channel by
+    """For each track the best combinations of measurements in its gate, by their factors channel by
     channel.
     """
     if not (len(forecast.mean) and len(scan.value)):
         return []
     predicted, jacobian = model.observe(forecast.mean)
-    spread = np.einsum("upi,uij,upj->up", jacobian, forecast.covariance, jacobian) + np.diag(noise)
     which = np.arange(len(scan.value))
     vector = np.full((len(scan.value), model.channels), np.nan)
     vector[which, scan.channel] = scan.value
     apart = model.innovation(vector[None], predicted[:, None])[:, which, scan.channel]
-    variance = spread[:, scan.channel]
+    variance = _variances(jacobian, forecast, noise)[:, scan.channel]
     inside = apart**2 < gate_std**2 * variance
     score = -0.5 * (apart**2 / variance + np.log(2.0 * np.pi * variance)) - np.maximum(
         scan.log_clutter, FLOOR
