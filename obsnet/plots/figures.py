@@ -122,6 +122,8 @@ def _days(run: Run, columns: Columns, reference: Reference) -> Figure:
         for ax in (above, below):
             overlay.shade_segments(ax, run, start, end)
             style.time_axis(ax, start, end, labelled=ax is below, most=13)
+        if start != rows[-1]:
+            below.set_xlabel("")
     style.title(made, _title(run, columns, "detections and segments"))
     overlay.legend(made, run, reference, by_rate=True, segments=True)
     return made

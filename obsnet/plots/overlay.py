@@ -98,12 +98,13 @@ def curves(ax: Axes, run: Run, reference: list[ReferenceTrack], kind: Kind, star
         time, values = heard(track, delay).on(kind)
         ax.plot(time, values, lw=1.3, zorder=4, **style.track_style(number))
         if len(run.tracks) > 1 and len(here) <= NUMBERED:
-            inside = np.flatnonzero(
-                (time >= style.days(start)) & (time <= style.days(end)) & np.isfinite(values)
+            low, high = ax.get_ylim()
+            inside = (
+                (time >= style.days(start)) & (time <= style.days(end)) & (values > low) & (values < high)
             )
-            if len(inside):
-                middle = inside[len(inside) // 2]
-                style.number(ax, number, time[middle], values[middle])
+            if inside.any():
+                at = np.flatnonzero(inside)[inside.sum() // 5]
+                style.number(ax, number, time[at], values[at])
     for ship in reference:
         curve = reference_heard(ship, delay, start, end)
         if curve is not None:

@@ -20,7 +20,8 @@ from obsnet.run import Run
 _COLUMNS = 740
 _PAGE = (13.6, 9.4)
 _LEFT, _WIDTH = 0.75, 7.2
-_CLOSE_UPS = 3
+_CLOSE_UPS, _SHORT = 3, 11
+"""Close-ups of so many tracks, where the text has fewer lines than that."""
 
 
 def report(run: Run, path: str | Path | None = None, reference: list[ReferenceTrack] | None = None) -> Figure:
@@ -84,9 +85,11 @@ def _fill(made: Figure, run: Run, reference: list[ReferenceTrack], columns: Colu
     words = style.box(made, 9.0, 2.0, 4.5, 2.25)
     words.set_axis_off()
     _legend(words, run, reference)
-    words.text(0.0, 0.70, _text(run), fontsize=8, va="top", family="monospace", linespacing=1.4)
+    text = _text(run)
+    words.text(0.0, 0.70, text, fontsize=8, va="top", family="monospace", linespacing=1.4)
     located = [(n, track) for n, track in enumerate(run.tracks) if np.isfinite(track.std).all()]
-    for place, (number, track) in enumerate(located if len(run.tracks) <= _CLOSE_UPS else []):
+    room = _CLOSE_UPS if text.count("\n") < _SHORT else 0
+    for place, (number, track) in enumerate(located[:room]):
         close_up(style.box(made, 9.35 + 1.5 * place, 0.35, 1.2, 1.2), track, number, reference)
 
 

@@ -108,15 +108,14 @@ def nice_ticks(low: float, high: float, most: int = 6) -> np.ndarray:
 
 def bar(ax: Axes, picture: AxesImage, label: str) -> None:
     """Colour bar of an image, beside its axes; light, where matplotlib's own is slow."""
-    made = ax.figure
+    made: Any = ax.figure
     place = ax.get_position()
     width = 0.11 / made.get_size_inches()[0]
     cax = made.add_axes((place.x1 + 0.6 * width, place.y0, width, place.height))
-    low, high = picture.norm.vmin, picture.norm.vmax
+    low, high = (float(limit) for limit in picture.get_clim())  # type: ignore[arg-type]
     shades = np.linspace(low, high, 128)[:, None]
-    cax.imshow(
-        shades, origin="lower", aspect="auto", extent=(0, 1, low, high), cmap=picture.cmap, norm=picture.norm
-    )
+    extent = (0.0, 1.0, low, high)
+    cax.imshow(shades, origin="lower", aspect="auto", extent=extent, cmap=picture.cmap, vmin=low, vmax=high)
     cax.yaxis.tick_right()
     cax.yaxis.set_label_position("right")
     cax.set_xticks([])
