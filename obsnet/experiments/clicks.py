@@ -169,9 +169,9 @@ def clutter_scene(rng: np.random.Generator) -> tuple[TdoaScene, CompactArray, np
 
 
 def two_animal_scene(rng: np.random.Generator) -> tuple[TdoaScene, CompactArray, np.ndarray]:
-    """Simulated TDOAs of one animal that ends after 225 s and one that begins after 75 s.
+    """Simulated TDOAs of one animal that ends after three quarters and one that begins after a quarter.
 
-    One scan a second; the animals are at the same azimuth after 150 s.
+    One scan a second; the animals are at the same azimuth at half time.
     """
     array = CompactArray.tetrahedron()
     pairs = array.pairs(every=False)
@@ -181,7 +181,7 @@ def two_animal_scene(rng: np.random.Generator) -> tuple[TdoaScene, CompactArray,
     meeting, own = (path.direction(half, array.mean_depth_m)[0] for path in (first, second))
     paths = [first, second.turned(float(meeting - own))]
     heard = rng.random((2, len(time))) < 0.9
-    heard &= np.stack([time < 225.0, time >= 75.0])
+    heard &= np.stack([time < 0.75 * DURATION_S, time >= 0.25 * DURATION_S])
     return simulated_tdoas(rng, array, pairs, paths, time, heard, detection=0.98), array, pairs
 
 

@@ -12,9 +12,10 @@ from obsnet.arrays.clicks import ClickRecord
 from obsnet.arrays.compact import CompactArray
 from obsnet.experiments import montecarlo
 from obsnet.experiments.click_scenes import QUANTISATION_S, AnimalPath
-from obsnet.experiments.click_scores import audible
+from obsnet.experiments.click_scores import audible, own_tdoas
 from obsnet.experiments.clicks_result import CUTOFF_DEG
 from obsnet.kinematics import wrap180
+from obsnet.trackers.association import Association
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,37 +110,30 @@ def _clutter_panels(tdoa: Axes, azimuth: Axes, elevation: Axes, rng: np.random.G
     tdoa.plot(time[owner < 0], 1e3 * value[owner < 0], ".", ms=2, color=CLUTTER, label="called clutter")
     tdoa.plot(time[owner >= 0], 1e3 * value[owner >= 0], ".", ms=2.5, color=TRACK, label="the animal's")
     tdoa.set_ylabel("TDOA (ms)")
-    tdoa.set_title("One animal: TDOAs of three pairs, clutter as in the paper's fig. 7", size=10, loc="left")
-    tdoa.legend(loc="upper right", fontsize=8, framealpha=0.9)
-    own = np.array([value[np.lexsort((channel, animal != 0))][:3] for channel, value, animal in _each(scene)])
-    fit = directions(own, array, pairs, np.eye(3) * QUANTISATION_S**2)
+    tdoa.set_title("One animal: TDOAs of three pairs, with clutter", size=10, loc="left")
+    tdoa.legend(loc="upper right", fontsize=8, framealpha=0.9, markerscale=4)
+    fit = directions(own_tdoas(scene, 3), array, pairs, np.eye(3) * QUANTISATION_S**2)
     truth = scene.paths[0].direction(scene.time, array.mean_depth_m)
-    for axis, number, points, name in (
-        (azimuth, 0, fit.azimuth_deg, "azimuth (deg)"),
-        (elevation, 1, fit.elevation_deg, "elevation (deg)"),
-    ):
-        centre = truth[number]
-        base = np.unwrap(centre, period=360.0) if number == 0 else centre
-        axis.plot(
-            scene.time,
-            base + wrap180(points - centre),
-            "o",
-            ms=2.5,
-            mfc="none",
-            color=POINT,
-            label="regression",
-        )
-        for track in found.tracks:
-            here = np.searchsorted(scene.time, track.time)
-            said = (track.azimuth_deg, track.elevation_deg)[number]
-            axis.plot(
-                track.time, base[here] + wrap180(said - centre[here]), color=TRACK, lw=2.2, label="smoother"
-            )
-        axis.plot(scene.time, base, "--", color=TRUTH, lw=0.9, label="truth")
-        axis.set_ylabel(name)
+    _angle_panel(azimuth, scene.time, np.unwrap(truth[0], period=360.0), fit.azimuth_deg, found, 0)
+    _angle_panel(elevation, scene.time, truth[1], fit.elevation_deg, found, 1)
+    azimuth.set_ylabel("azimuth (deg)")
+    elevation.set_ylabel("elevation (deg)")
     azimuth.set_title("Its azimuth: regression without clutter, smoother with it", size=10, loc="left")
     elevation.set_title("Its elevation", size=10, loc="left")
     azimuth.legend(fontsize=8, framealpha=0.9)
+
+
+def _angle_panel(
+    axis: Axes, time: np.ndarray, truth: np.ndarray, points: np.ndarray, found: Association, angle: int
+) -> None:
+    """One angle (0: azimuth, 1: elevation) by regression and smoother, drawn around the truth without a seam."""
+    near = truth + wrap180(points - truth)
+    axis.plot(time, near, "o", ms=2.5, mfc="none", color=POINT, label="regression")
+    for track in found.tracks:
+        centre = truth[np.searchsorted(time, track.time)]
+        said = (track.azimuth_deg, track.elevation_deg)[angle]
+        axis.plot(track.time, centre + wrap180(said - centre), color=TRACK, lw=2.2, label="smoother")
+    axis.plot(time, truth, "--", color=TRUTH, lw=0.9, label="truth")
 
 
 def _two_animal_panels(
@@ -195,16 +189,13 @@ def _map_panel(axis: Axes, record: ClickRecord, paths: list[AnimalPath]) -> None
     maps = record.azimuth_map(times)
     llr = np.maximum(maps["azimuth_llr"].values.T, 0.0)
     image = axis.pcolormesh(times, maps["azimuth"].values, llr, cmap="Greys", shading="nearest")
-    for path in paths:
-        azimuth = path.direction(times, record.array.mean_depth_m)[0]
-        axis.plot(times, _broken(azimuth), "--", color=POINT, lw=1.0)
+    truth = [path.direction(times, record.array.mean_depth_m)[0] for path in paths]
+    for azimuth in truth:
+        axis.plot(times, _broken(azimuth), "--", color=POINT, lw=0.9)
+    axis.set_ylim(max(np.min(truth) - 20.0, 0.0), min(np.max(truth) + 20.0, 360.0))
     axis.figure.colorbar(image, ax=axis, label="log-likelihood ratio")
     axis.set_ylabel("azimuth (deg)")
     axis.set_title("Azimuth map of the same recording, truth dashed", size=10, loc="left")
-
-
-def _each(scene: Any) -> Any:
-    return zip(scene.channel, scene.value, scene.animal, strict=True)
 
 
 def _broken(angle: np.ndarray) -> np.ndarray:
