@@ -35,6 +35,9 @@ LEAST_VISIBILITY = 0.02
 UNDERFLOW_SIGMAS = 38.6
 """exp(−x²/2) is zero in double precision beyond this many standard deviations."""
 
+NEGLIGIBLE_SIGMAS = 11.0
+"""A detection this far off adds less than rounding to a sum in which every pair may also have been missed."""
+
 NEVER_SIGMAS = 9.0
 """The tail of a normal distribution beyond this many standard deviations is less than 1's rounding."""
 
@@ -110,7 +113,7 @@ class ImageModel:
         factors = np.array([IMAGE_DEPTHS[path] for path in self.paths], float)
         images = factors @ np.array([self.water_depth_m, receiver_depth_m])
         range_m, depth_m = np.asarray(range_m, float), np.asarray(depth_m, float)
-        lengths = np.hypot(depth_m[:, None] - images, range_m[:, None])
+        lengths = np.sqrt((depth_m[:, None] - images) ** 2 + range_m[:, None] ** 2)
         lengths[(range_m < 0) | (depth_m < 0) | (depth_m > self.water_depth_m)] = np.nan
         return np.abs(lengths[:, self._first] - lengths[:, self._second]) / self.sound_speed_mps
 
@@ -232,51 +235,72 @@ def association_log_likelihood(
 @njit(cache=True, nogil=True)
 def _sum_associations(predicted, measured, detection, std, density, low, high):
     n_source, n_pair = predicted.shape
-    n_sets = 1 << n_pair
     log_ratio = np.empty(n_source)
     expected = np.empty(n_source)
-    served = np.empty(n_sets)
-    ratio = np.empty(n_pair)
+    served = np.empty(1 << n_pair)
+    rest = np.empty(1 << n_pair)
     miss = np.empty(n_pair)
-    scale = 1.0 / (np.sqrt(2.0 * np.pi) * density)
+    ratio = np.empty(n_pair)
+    close = np.empty(n_pair, np.int64)
+    precision = 1.0 / std
+    peak = precision / (np.sqrt(2.0 * np.pi) * density)
     for j in range(n_source):
+        reach, total, weighted = NEGLIGIBLE_SIGMAS, 1.0, 0.0
         for pair in range(n_pair):
             miss[pair] = 1.0
             if not np.isnan(predicted[j, pair]):
                 miss[pair] -= detection[j, pair] * _inside(predicted[j, pair], std[pair], low, high)
-        served[:] = 0.0
-        served[0] = 1.0
+            total *= miss[pair]
+            if miss[pair] < 1e-3:
+                reach = UNDERFLOW_SIGMAS
+        anything = False
         for m in range(len(measured)):
-            near = False
+            n_close = 0
             for pair in range(n_pair):
-                ratio[pair] = 0.0
-                distance = abs(measured[m] - predicted[j, pair]) / std[pair]
-                if distance < UNDERFLOW_SIGMAS:
-                    ratio[pair] = detection[j, pair] * scale / std[pair] * np.exp(-0.5 * distance * distance)
-                    near = True
-            if near:
-                _serve(served, ratio)
-        total, weighted = 0.0, 0.0
-        for chosen in range(n_sets):
-            term, count = served[chosen], 0
-            for pair in range(n_pair):
-                if chosen >> pair & 1:
-                    count += 1
-                else:
-                    term *= miss[pair]
-            total += term
-            weighted += count * term
+                distance = (measured[m] - predicted[j, pair]) * precision[pair]
+                if abs(distance) < reach:
+                    ratio[n_close] = detection[j, pair] * peak[pair] * np.exp(-0.5 * distance * distance)
+                    close[n_close] = 1 << pair
+                    n_close += 1
+            if n_close > 0:
+                if not anything:
+                    served[:] = 0.0
+                    served[0] = 1.0
+                    anything = True
+                _serve(served, close, ratio, n_close)
+        if anything:
+            total, weighted = _collect(served, miss, rest)
         log_ratio[j] = np.log(total) if total > 0.0 else -np.inf
         expected[j] = weighted / total if total > 0.0 else 0.0
     return log_ratio, expected
 
 
 @njit(cache=True, nogil=True)
-def _serve(served, ratio):
+def _serve(served, close, ratio, n_close):
     for chosen in range(len(served) - 1, 0, -1):
-        for pair in range(len(ratio)):
-            if chosen >> pair & 1:
-                served[chosen] += ratio[pair] * served[chosen ^ (1 << pair)]
+        for i in range(n_close):
+            if chosen & close[i]:
+                served[chosen] += ratio[i] * served[chosen ^ close[i]]
+
+
+@njit(cache=True, nogil=True)
+def _collect(served, miss, rest):
+    last = len(served) - 1
+    rest[last] = 1.0
+    total, weighted = served[last], len(miss) * served[last]
+    for chosen in range(last - 1, -1, -1):
+        left_out = 0
+        while chosen >> left_out & 1:
+            left_out += 1
+        rest[chosen] = rest[chosen | 1 << left_out] * miss[left_out]
+        term = served[chosen] * rest[chosen]
+        total += term
+        if term > 0.0:
+            count = 0
+            for pair in range(len(miss)):
+                count += chosen >> pair & 1
+            weighted += count * term
+    return total, weighted
 
 
 @njit(cache=True, nogil=True)

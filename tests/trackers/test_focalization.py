@@ -139,7 +139,7 @@ def test_depth_is_found_where_the_paths_tell_it():
         depth_rate_std_mps=0.05,
         max_range_m=600.0,
         acceleration_std_mps2=0.02,
-        particles=20_000,
+        particles=10_000,
     )
     rng = np.random.default_rng(1)
     particle = FocalizationFilter(model, config)

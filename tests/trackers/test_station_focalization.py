@@ -70,12 +70,12 @@ def ghosts(distance):
     return np.array(found)
 
 
-@pytest.mark.parametrize(("cpa_m", "loudness", "seed"), [(9e3, 1.0, 0), (20e3, 1.0, 1), (12e3, 0.6, 2)])
-@pytest.mark.parametrize("amplitudes", [AMPLITUDES, None])
-def test_range_is_followed_and_ghosts_are_rejected_where_two_branches_show(
-    table, cpa_m, loudness, seed, amplitudes
-):
-    times, values, distance = simulate(StraightCourse(0.0, cpa_m, 30.0, 7.5), -7200, 7200, loudness, seed)
+@pytest.mark.parametrize(
+    ("cpa_m", "loudness", "seed", "amplitudes"),
+    [(9e3, 1.0, 0, AMPLITUDES), (12e3, 0.6, 2, AMPLITUDES), (20e3, 1.0, 1, None)],
+)
+def test_range_is_followed_and_ghosts_are_rejected(table, cpa_m, loudness, seed, amplitudes):
+    times, values, distance = simulate(StraightCourse(0.0, cpa_m, 30.0, 7.5), -5400, 5400, loudness, seed)
     scans = focalize_station(values, QUEFRENCY, times, table, CONFIG, amplitudes)
     truth = np.interp(scans.time_s, times, distance)
     # The first ten minutes of two branches are the filter's to decide between them.
@@ -109,7 +109,7 @@ def test_the_rate_and_the_maps_tell_the_same_story(table):
 
 
 def test_noise_alone_is_no_ship(table):
-    times, values, _ = simulate(StraightCourse(0.0, 9e3, 30.0, 7.5), 0, 4 * 3600, 0.0, 4)
+    times, values, _ = simulate(StraightCourse(0.0, 9e3, 30.0, 7.5), 0, 2 * 3600, 0.0, 4)
     for amplitudes in (AMPLITUDES, None):
         scans = focalize_station(values, QUEFRENCY, times, table, CONFIG, amplitudes)
         assert np.mean(scans.existence_llr > 0) < 0.03
