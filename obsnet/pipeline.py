@@ -32,6 +32,7 @@ from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
 from obsnet.trackers.grid_search import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
+from obsnet.trackers.station_focalization import StationFocalization, StationScans
 
 LONG_SILENCE_S = 86400.0
 """A silence longer than this has no rows; the record goes on after it as if it began there."""
@@ -100,6 +101,8 @@ class Pipeline:
         self._null: np.ndarray | None = None
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
+        self._follower = StationFocalization(self.table) if config.tracker == "focalization" else None
+        self._followed: list[StationScans] = []
         self._next: float | None = None
         self._last: float | None = None
 
@@ -128,6 +131,19 @@ class Pipeline:
             return None
         return self._finish(float(to_posix(held["time"].values[-1])))
 
+    def followed(self) -> pd.DataFrame:
+        """What the focalization tracker knew after each scan: time, range, its spread, range rate and existence."""
+        if self._follower is None:
+            return pd.DataFrame()
+        scans = [*self._followed, self._follower.flush()]
+
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([getattr(scan, name) for scan in scans])
+
+        table = {"time": from_posix(joined("time_s")), "existence_llr": joined("existence_llr")}
+        names = ("range_mode_m", "mode_probability", "range_mean_m", "range_std_m", "range_rate_mps")
+        return pd.DataFrame(table | {name: joined(name) for name in (*names, "range_rate_std_mps")})
+
     def _take(self, spectra: xr.Dataset) -> None:
         if "east" in spectra and "north" in spectra:
             azimuths = azigram(spectra, self.config.azigram)
@@ -135,7 +151,11 @@ class Pipeline:
             self._null = null if self._null is None else _join(self._null, null)
             self._azigram = _concat(self._azigram, azimuths)
         if "p" in spectra:
-            self._cepstrogram = _concat(self._cepstrogram, self._clutter(cepstrogram(spectra)))
+            cepstra = self._clutter(cepstrogram(spectra))
+            self._cepstrogram = _concat(self._cepstrogram, cepstra)
+            if self._follower is not None:
+                times = to_posix(cepstra["time"].values)
+                self._followed.append(self._follower.push(cepstra.values, cepstra["quefrency"].values, times))
         self._spectrogram = _concat(self._spectrogram, _power(spectra))
 
     def _finish(self, ready: float) -> Minutes | None:

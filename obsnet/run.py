@@ -24,7 +24,7 @@ import obsnet
 from obsnet import netcdf
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps
-from obsnet.errors import LayoutError, OutputError
+from obsnet.errors import ConfigError, LayoutError, OutputError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -34,6 +34,7 @@ from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
 from obsnet.trackers.bearings_only import track_bearings
+from obsnet.trackers.bernoulli import track_azimuth
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import Segment, Track
@@ -58,6 +59,7 @@ class Run:
     presence : DataFrame of log presence ratios, indexed by s since 1970.
     segments : list of Segment. tracks : list of Track.
     table : propagation table. info : what run.json holds.
+    live : what a live tracker (bernoulli, focalization) knew minute by minute or scan by scan; empty for the grid search.
     """
 
     station: Station
@@ -70,6 +72,7 @@ class Run:
     tracks: list[Track]
     table: xr.Dataset
     info: dict[str, Any] = field(default_factory=dict)
+    live: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def delay(self, range_m: np.ndarray) -> np.ndarray:
         """Travel time [s] of the loudest path against range [m]."""
@@ -169,6 +172,7 @@ def _run(
         maps, features = sink.close()
     run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
     if tracking and len(run.presence):
+        run.live = pipeline.followed() if config.tracker == "focalization" else run.live
         run.segments, run.tracks = find_tracks(run, threads)
         clock.lap("track")
     run.info = _describe(run, source, clock)
@@ -195,7 +199,7 @@ def _stream(
 def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
     """Segments of a run's presence and the tracks within them, in time order."""
     delay = travel_time(run.table)
-    found = segments(run.presence, run.config.segmentation)
+    found = _followed(run) if run.config.tracker == "bernoulli" else segments(run.presence, run.config.segmentation)
     tracks: list[Track] = []
     for segment in found:
         near = [known for known in tracks if known.end > segment.start - 3600.0]
@@ -206,6 +210,25 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
             new = [replace(track, method=f"{track.method}; course ambiguous by 180°") for track in new]
         tracks += new
     return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
+
+
+def _followed(run: Run) -> list[Segment]:
+    """Segments in which the Bernoulli filter, minute by minute, holds a ship for sure (existence over 0.9)."""
+    if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
+        raise ConfigError("the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid")
+    times = to_posix(run.maps["time"].values)
+    held = track_azimuth(times, run.maps["azimuth_llr"].values, run.maps["azimuth"].values)
+    run.live = pd.DataFrame(
+        {
+            "time": run.maps["time"].values,
+            "existence": held.existence,
+            "azimuth_deg": held.azimuth_deg,
+            "azimuth_std_deg": held.azimuth_std_deg,
+        }
+    )
+    sure = np.flatnonzero(np.diff(np.concatenate([[False], held.existence > 0.9, [False]]).astype(np.int8)))
+    stretches = [Segment(float(times[lo]), float(times[hi - 1])) for lo, hi in zip(sure[::2], sure[1::2], strict=True)]
+    return [s for s in stretches if s.end - s.start >= 60.0 * run.config.segmentation.shortest_min]
 
 
 def _range_heard(run: Run, segment: Segment) -> bool:
@@ -345,6 +368,10 @@ def write_tables(run: Run, folder: Path) -> None:
     rows = pd.DataFrame([found.row(i) for i, found in enumerate(run.tracks, 1)], columns=TRACK_COLUMNS)
     write_text(folder / "tracks.csv", rows.to_csv(index=False, float_format="%.6g"))
     write_text(folder / "tracks.geojson", json.dumps(geojson(run.tracks, run.station)))
+    if len(run.live):
+        stamps = np.datetime_as_string(run.live["time"].to_numpy("datetime64[s]"))
+        live = run.live.assign(time=np.char.add(stamps, "Z"))
+        write_text(folder / "live.csv", live.to_csv(index=False, float_format="%.6g"))
     write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
 
 

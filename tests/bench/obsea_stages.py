@@ -46,7 +46,7 @@ def run(folder: Path, out: Path, tracking: bool = True) -> dict[str, float]:
     ocean = OceanConfig()
     table = propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
     # It reads r + v·δt without looking at the grid's end: its model must reach further than its grid, as its scripts' does.
-    config = RangeDetectorConfig(max_range_m=60_000.0)
+    config = RangeDetectorConfig(max_range_m=60_000.0, pairs=("1-3", "3-5", "5-7"))
     quefrency = np.arange(513) * 0.02
     pulses = cepstral_model(quefrency, table, Amplitudes.table_ii().scaled_to(station.depth_m), config)
     delays = np.stack([tdoa(table, pair).interp(range=config.range_m).values for pair in config.pairs])
