@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from obsnet.calibration.envelope import Branches, Offset, fit, locate, stack
+from obsnet.calibration.envelope import Branches, fit, locate, stack
 from obsnet.calibration.orientation import Rotation, downward_flux, rotation
-from obsnet.calibration.passages import gather
+from obsnet.calibration.passages import Passages, gather
 from obsnet.calibration.result import Calibration, Orientation, Polarity, Position, moved
 from obsnet.errors import ConfigError
 from obsnet.layout import to_posix
@@ -137,17 +137,8 @@ def calibrate(
     notes: list[str] = []
     expected = Amplitudes.default().scaled_to(station.depth_m)
     branches = Branches(passages, table, tuple(pair for pair in config.pairs if pair in expected.pairs))
-    offset = locate(branches, expected, config.search_m, config.search_step_m)
-    place = _position(station, offset, notes)
+    place, turned = _place_and_turn(station, passages, branches, expected, config, notes)
     shift = (place.east_m, place.north_m) if place else (0.0, 0.0)
-    turned = rotation(
-        passages,
-        shift,
-        average_s=config.average_s,
-        min_snr_db=config.min_snr_db,
-        min_range_m=config.min_range_m,
-        max_range_m=config.max_range_m,
-    )
     polarity = _polarity(station, downward_flux(passages), notes)
     edges = np.arange(0.0, config.amplitude_range_m + config.bin_m / 2, config.bin_m)
     stacked = stack(branches, shift, edges)
@@ -210,20 +201,37 @@ def calibrate_waveforms(
     return calibrate(blocks(), station, tracks, propagation_table(settings.ocean, station.depth_m), config)
 
 
-def _position(station: Station, offset: Offset | None, notes: list[str]) -> Position | None:
-    if offset is None or not offset.determined:
+def _place_and_turn(
+    station: Station,
+    passages: Passages,
+    branches: Branches,
+    amplitudes: Amplitudes,
+    config: CalibrationConfig,
+    notes: list[str],
+) -> tuple[Position | None, Rotation | None]:
+    """Place of the station and rotation of its azimuths there; the azimuths choose between mirror images."""
+
+    def turn(shift_m: tuple[float, float]) -> Rotation | None:
+        return rotation(
+            passages,
+            shift_m,
+            average_s=config.average_s,
+            min_snr_db=config.min_snr_db,
+            min_range_m=config.min_range_m,
+            max_range_m=config.max_range_m,
+        )
+
+    places = locate(branches, amplitudes, config.search_m, config.search_step_m)
+    turns = [turn((place.east_m, place.north_m)) for place in places]
+    fits = [found.log_likelihood if found else -np.inf for found in turns]
+    if not places or (len(places) > 1 and not np.isfinite(fits).any()):
         notes.append("the cepstral branches do not determine the position; it is left as it was")
-        return None
+        return None, turn((0.0, 0.0))
+    best = int(np.argmax(fits))
+    offset = places[best]
     latitude, longitude = moved(station, offset.east_m, offset.north_m)
-    return Position(
-        latitude,
-        longitude,
-        offset.east_m,
-        offset.north_m,
-        offset.east_std_m,
-        offset.north_std_m,
-        offset.correlation,
-    )
+    stds = (offset.east_std_m, offset.north_std_m, offset.correlation)
+    return Position(latitude, longitude, offset.east_m, offset.north_m, *stds), turns[best]
 
 
 def _polarity(station: Station, flux: float | None, notes: list[str]) -> Polarity | None:

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.signal
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter
 from scipy.optimize import least_squares
 
 from obsnet.calibration.passages import Passages, vertex
 from obsnet.ocean.amplitudes import Amplitudes, SkewNormal
-from obsnet.ocean.rays import parse_pair, tdoa
+from obsnet.ocean.rays import parse_pair, tdoa, travel_time
 from obsnet.signals.cepstrogram import noise_std
 
-FINE_STEPS = 6
 BLOCK_S = 1200.0
 CLIP = 40.0
 SEPARATION_S = 0.15
@@ -25,6 +24,9 @@ LAGS = np.arange(-4, 5)
 MIN_FRAMES = 20
 MIN_BIN_FRAMES = 8
 SIGNIFICANCE = 8.0
+BLUR = 2.0
+RIVAL, MAX_RIVALS = 0.6, 3
+MODEL_STD_M, MAX_STD_M = 25.0, 300.0
 UNHEARD = 0.02
 
 
@@ -33,8 +35,7 @@ class Offset:
     """Offset of the station from its stated position, m east and north, with standard deviations and
     correlation.
 
-    `significance` is the score of the offset over the standard deviation of noise; `determined` is false
-    where it is low, or the best offset lies at the edge of the search.
+    `significance` is its score over the standard deviation that noise alone would give the score.
     """
 
     east_m: float
@@ -43,7 +44,6 @@ class Offset:
     north_std_m: float
     correlation: float
     significance: float
-    determined: bool
 
 
 class Branches:
@@ -51,6 +51,9 @@ class Branches:
 
     With Ĉ the analytic cepstrum, |Ĉ/σ|² of noise is χ² with 2 degrees of freedom, and the mean of |Ĉ/σ|² − 2
     is |μ̂/σ|² (paper's eqs C1–C2).
+
+    A lag τ_ij in a frame centred at t pairs sound that came by path i at t − τ_ij/2 with its echo by path j
+    at t + τ_ij/2: it left the ship at t − (τ_i + τ_j)/2, some seconds from the loudest path's t − τ.
     """
 
     def __init__(self, passages: Passages, table: xr.Dataset, pairs: tuple[str, ...]) -> None:
@@ -68,12 +71,28 @@ class Branches:
         for i in range(len(self.pairs)):
             close = np.any(np.abs(np.delete(self.delay, i, 0) - self.delay[i]) < SEPARATION_S, axis=0)
             self.delay[i] = np.where(close, np.nan, self.delay[i])
+        self.east_m, self.north_m = self._emitted(table)
         # The first 0.3 s hold the source's own spectrum, the clutter filter notwithstanding.
         self.delay[self.delay < 0.3] = np.nan
 
-    def ranges(self, east_m: float, north_m: float) -> np.ndarray:
-        """Range [m] of each frame's ship from a station at this offset."""
-        return self.heard.relative_to(east_m, north_m)[1][:, 0]
+    def _emitted(self, table: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+        """East and north [m] of the ship at t − (τ_i + τ_j)/2, for each pair and frame."""
+        heard = self.heard
+        distance = heard.relative_to(0.0, 0.0)[1][:, 0]
+        loudest = travel_time(table)(distance)
+        later = np.zeros((len(self.pairs), distance.size))
+        for i, pair in enumerate(self.pairs):
+            mean = table["delay"].sel(path=list(parse_pair(pair))).mean("path", skipna=False).values
+            exists = np.isfinite(mean)
+            if exists.any():
+                later[i] = loudest - np.interp(distance, self.range_m[exists], mean[exists])
+        return heard.east_m[:, 0] + heard.east_mps * later, heard.north_m[:, 0] + heard.north_mps * later
+
+    def ranges(self, pair: int, offset_m: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        """Range [m], from a station at this offset, at which each frame's ship emitted what makes a pair's
+        lag.
+        """
+        return np.hypot(self.east_m[pair] - offset_m[0], self.north_m[pair] - offset_m[1])
 
     def read(self, excess: np.ndarray, pair: int, range_m: np.ndarray, lag_s: float = 0.0) -> np.ndarray:
         """Excess of each frame at a pair's delay for the ranges [m]; NaN where the pair is not to be seen."""
@@ -93,57 +112,70 @@ class Branches:
         return np.interp(delay, self.step * np.arange(self.std.size), self.std) ** 2
 
 
-def locate(branches: Branches, amplitudes: Amplitudes, search_m: float, step_m: float) -> Offset | None:
-    """Offset of the station that puts the cepstral branches of all passages where the AIS ranges say.
+def locate(branches: Branches, amplitudes: Amplitudes, search_m: float, step_m: float) -> list[Offset]:
+    """Offsets of the station that put the cepstral branches of all passages where the AIS ranges say.
 
     The score of an offset is the sum over frames and pairs of a_ij(r)²/σ² times the excess at τ_ij(r), the
     locally best statistic; it is searched over ±`search_m` and refined. Leaving out each stretch of 20 min in
-    turn gives the covariance (jackknife).
+    turn gives the covariance (jackknife), to which `MODEL_STD_M` is added for what the delays leave out, the
+    sediment above all.
 
     Returns
     -------
-    Offset, or none without frames.
+    list of Offset, the best first; empty where nothing stands out of the noise or the passages leave a
+    direction open. Ranges to straight courses alone do not tell a place from its mirror image beyond the
+    course: there may be two.
     """
     if branches.heard.time.size < MIN_FRAMES:
-        return None
-    nominal = branches.ranges(0.0, 0.0)
+        return []
     weights = np.stack(
         [
-            amplitudes.evaluate(pair, nominal) ** 2 / branches.variance(i, nominal)
+            amplitudes.evaluate(pair, branches.ranges(i)) ** 2 / branches.variance(i, branches.ranges(i))
             for i, pair in enumerate(branches.pairs)
         ]
     )
-    blocks = branches.heard.blocks(BLOCK_S)
-    blurred = gaussian_filter1d(np.minimum(branches.excess, CLIP), 2.0, axis=1)
-    coarse = np.arange(-search_m, search_m + step_m / 2, step_m)
-    scores = _scores(branches, blurred, weights, coarse, coarse, np.zeros_like(blocks))[0]
-    row, column = np.unravel_index(scores.argmax(), scores.shape)
-    fine = step_m / FINE_STEPS
-    around = np.arange(-1.5 * step_m, 1.5 * step_m + fine / 2, fine)
-    east, north = coarse[row] + around, coarse[column] + around
-    parts = _scores(branches, np.minimum(branches.excess, CLIP), weights, east, north, blocks)
-    parts = gaussian_filter1d(gaussian_filter1d(parts, 1.0, axis=1), 1.0, axis=2)
-    total = parts.sum(axis=0)
+    blurred = gaussian_filter1d(np.minimum(branches.excess, CLIP), BLUR, axis=1)
+    grid = np.arange(-search_m, search_m + step_m / 2, step_m)
+    scores = _scores(branches, blurred, weights, grid, grid, np.zeros(branches.heard.time.size, int))[0]
+    scores -= np.median(scores)
+    # |Ĉ/σ|² has variance 4, frames overlap by half, and the blur averages neighbours.
+    noise = float(np.sqrt(2.0 * 4.0 * np.nansum(weights**2) / (2.0 * BLUR * np.sqrt(np.pi))))
+    peaks = (scores == maximum_filter(scores, 7)) & (scores > max(SIGNIFICANCE * noise, RIVAL * scores.max()))
+    best = np.unravel_index(scores.argmax(), scores.shape)
+    if not peaks[best] or min(best) == 0 or max(best) == grid.size - 1:
+        return []
+    peaks &= np.pad(np.ones((grid.size - 2, grid.size - 2), bool), 1)
+    order = sorted(np.argwhere(peaks), key=lambda at: -scores[tuple(at)])[:MAX_RIVALS]
+    refined = (_refine(branches, weights, (grid[i], grid[j]), step_m, scores[i, j] / noise) for i, j in order)
+    return [offset for offset in refined if offset is not None]
+
+
+def _refine(
+    branches: Branches, weights: np.ndarray, start: tuple[float, float], step_m: float, significance: float
+) -> Offset | None:
+    """Peak of the score near `start` and its covariance; none where leaving out a stretch moves it far
+    away.
+    """
+    excess, blocks = np.minimum(branches.excess, CLIP), branches.heard.blocks(BLOCK_S)
+    for reach in (1.5 * step_m, 4.5 * step_m):
+        around = np.linspace(-reach, reach, 2 * 9 + 1)
+        east, north = start[0] + around, start[1] + around
+        parts = _scores(branches, excess, weights, east, north, blocks)
+        parts = gaussian_filter1d(gaussian_filter1d(parts, 1.0, axis=1), 1.0, axis=2)
+        total = parts.sum(axis=0)
+        left_out = np.array([_peak(total - part, east, north) for part in parts])
+        if np.abs(left_out - np.array(start)).max() < reach and len(parts) > 1:
+            break
+    else:
+        return None
     best = _peak(total, east, north)
-    left_out = np.array([_peak(total - part, east, north) for part in parts])
-    share = (len(parts) - 1) / len(parts)
-    spread = share * (left_out - left_out.mean(axis=0)).T @ (left_out - left_out.mean(axis=0))
-    spread += np.eye(2) * (fine / 2) ** 2
+    scatter = left_out - left_out.mean(axis=0)
+    spread = (len(parts) - 1) / len(parts) * scatter.T @ scatter + np.eye(2) * MODEL_STD_M**2
     std = np.sqrt(np.diag(spread))
-    # |Ĉ/σ|² has variance 4; frames overlap by half.
-    noise = np.sqrt(2.0 * 4.0 * np.nansum(weights**2))
-    contrast = float((scores.max() - np.median(scores)) / max(noise, 1e-12))
-    at_edge = min(row, column) == 0 or max(row, column) == coarse.size - 1
-    determined = len(parts) > 1 and not at_edge and contrast > SIGNIFICANCE and std.max() < search_m / 2
-    return Offset(
-        float(best[0]),
-        float(best[1]),
-        float(std[0]),
-        float(std[1]),
-        float(spread[0, 1] / (std[0] * std[1])),
-        contrast,
-        bool(determined),
-    )
+    correlation = spread[0, 1] / (std[0] * std[1])
+    if std.max() > MAX_STD_M:
+        return None
+    return Offset(*map(float, (best[0], best[1], std[0], std[1], correlation, significance)))
 
 
 def stack(branches: Branches, offset_m: tuple[float, float], edges_m: np.ndarray) -> xr.Dataset:
@@ -155,12 +187,12 @@ def stack(branches: Branches, offset_m: tuple[float, float], edges_m: np.ndarray
     its standard error `error`, and the number of frames. The envelope is read at the lag, one per pair within
     ±0.08 s, at which the whole stack is strongest.
     """
-    distance = branches.ranges(*offset_m)
-    bins = np.digitize(distance, edges_m) - 1
     count = edges_m.size - 1
     shape = (len(branches.pairs), count)
     square, error, frames = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, int)
     for i in range(len(branches.pairs)):
+        distance = branches.ranges(i, offset_m)
+        bins = np.digitize(distance, edges_m) - 1
         readings = np.stack(
             [branches.read(branches.excess, i, distance, lag * branches.step) for lag in LAGS]
         )
@@ -255,7 +287,7 @@ def _scores(
     for pair, weight in enumerate(weights):
         counts = np.flatnonzero(weight > UNHEARD * weights.max())
         mine = excess[counts]
-        ship_east, ship_north = branches.heard.east_m[counts, 0], branches.heard.north_m[counts, 0]
+        ship_east, ship_north = branches.east_m[pair, counts], branches.north_m[pair, counts]
         for i, e in enumerate(east):
             for j, n in enumerate(north):
                 value = branches.read(mine, pair, np.hypot(ship_east - e, ship_north - n))

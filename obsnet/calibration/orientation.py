@@ -26,12 +26,14 @@ POSITION_ERROR_M = 100.0
 class Rotation:
     """How far the metadata's azimuths must be turned clockwise, [−180, 180) deg, and its standard deviation.
 
-    `by_frequency` holds frequency [Hz], mode [deg] and number of cells of each band.
+    `log_likelihood` is a cell's mean at the mode; `by_frequency` holds frequency [Hz], mode [deg] and number
+    of cells of each band.
     """
 
     angle_deg: float
     std_deg: float
     cells: int
+    log_likelihood: float
     by_frequency: tuple[tuple[float, float, int], ...]
 
 
@@ -85,7 +87,13 @@ def rotation(
         (float((k + 0.5) * BAND_HZ), _wrap(_mode(bands[k], fine)), int(counts[k]))
         for k in np.flatnonzero(counts)
     )
-    return Rotation(_wrap(best), float(max(std, MIN_STD_DEG)), int(every.size), listed)
+    return Rotation(
+        _wrap(best),
+        float(max(std, MIN_STD_DEG)),
+        int(every.size),
+        float(blocks.sum(axis=0).max() / every.size),
+        listed,
+    )
 
 
 def downward_flux(passages: Passages) -> float | None:

@@ -18,6 +18,7 @@ from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstro
 LEVELS_DB = np.arange(-200.0, 120.0, 1.0)
 QUIET_SHARE = 0.2
 SHIPS = 3
+HEARD = ("time", "east_m", "north_m", "passage", "alone", "east_mps", "north_mps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Heard:
         where fewer ships are known.
     passage : number of the nearest ship's track, (frame).
     alone : whether the second ship is too far away to matter, (frame).
+    east_mps, north_mps : velocity of the nearest ship, m/s, (frame).
     """
 
     time: np.ndarray
@@ -39,6 +41,8 @@ class Heard:
     north_m: np.ndarray
     passage: np.ndarray
     alone: np.ndarray
+    east_mps: np.ndarray
+    north_mps: np.ndarray
 
     def relative_to(self, east_m: float, north_m: float) -> tuple[np.ndarray, np.ndarray]:
         """Azimuth [deg] and range [m] of the ships from a station at this offset from its stated position."""
@@ -51,9 +55,7 @@ class Heard:
         return np.unique(key, axis=1, return_inverse=True)[1].ravel()
 
     def __getitem__(self, which: np.ndarray) -> Heard:
-        return Heard(
-            self.time[which], self.east_m[which], self.north_m[which], self.passage[which], self.alone[which]
-        )
+        return Heard(*(getattr(self, name)[which] for name in HEARD))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +136,7 @@ def gather(
         heard, near = heard_ships(times, tracks, delay, max_range_m, isolation)
         cells = {name: values[:, near].T for name, values in cells.items()}
         cells["cepstra"] = cepstra.values.T[near]
-        cells |= {"time": heard.time, "east": heard.east_m, "north": heard.north_m, "passage": heard.passage}
-        cells["alone"] = heard.alone
+        cells |= {name: getattr(heard, name) for name in HEARD}
         kept.append(cells)
     if names is None or background is None or not sum(len(part["time"]) for part in kept):
         raise AISError(_nobody(tracks, span, max_range_m))
@@ -143,7 +144,7 @@ def gather(
     frequency, quefrency, nfft = names
     level, direction = background.quietest()
     return Passages(
-        Heard(whole["time"], whole["east"], whole["north"], whole["passage"], whole["alone"]),
+        Heard(*(whole[name] for name in HEARD)),
         frequency[_band(frequency, fmin_hz, fmax_hz)],
         whole["power"].T,
         whole["intensity"].T if "intensity" in whole else None,
@@ -171,19 +172,23 @@ def heard_ships(
     """
     shape = (times.size, max(len(tracks), SHIPS))
     azimuth, distance, known = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape, bool)
+    velocity = np.zeros((2, *shape))
     for i, track in enumerate(tracks):
         found, range_m, _ = track.heard(times, delay)
         there = np.isfinite(range_m)
         azimuth[there, i], distance[there, i] = found[there], range_m[there]
         emitted = times - np.where(there, delay(np.where(there, range_m, 0.0)), 0.0)
         known[:, i] = there & ~track.at(emitted)[2]
+        velocity[:, :, i] = track.velocity(emitted)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :SHIPS]
     azimuth, distance, known = (np.take_along_axis(x, nearest, axis=1) for x in (azimuth, distance, known))
     near = known[:, 0] & (distance[:, 0] <= max_range_m)
+    first = nearest[near, 0]
     azimuth, distance = np.deg2rad(azimuth[near]), distance[near]
     far = np.where(np.isfinite(distance), distance, 1e9)
     alone = far[:, 1] > isolation * far[:, 0]
-    return Heard(times[near], far * np.sin(azimuth), far * np.cos(azimuth), nearest[near, 0], alone), near
+    east, north = far * np.sin(azimuth), far * np.cos(azimuth)
+    return Heard(times[near], east, north, first, alone, *velocity[:, near, first]), near
 
 
 def vertex(values: np.ndarray, at: int) -> float:

@@ -49,7 +49,8 @@ def passages(turn_deg, courses=((6000.0, 1.0),), directed=0.6, seed=0, snr=30.0,
     ships = np.array(places + far)
     order = np.argsort(np.hypot(ships[:, 0], ships[:, 1]), axis=0)
     east, north = (np.take_along_axis(ships[:, k], order, axis=0).T for k in (0, 1))
-    heard = Heard(time, east, north, order[0], np.ones(FRAMES, bool))
+    still = np.zeros(FRAMES)
+    heard = Heard(time, east, north, order[0], np.ones(FRAMES, bool), still, still)
     noise = directed * -np.exp(1j * np.deg2rad(250.0 - turn_deg)) * -sign * np.ones(FREQUENCY.size)
     return Passages(
         heard, FREQUENCY, np.abs(p) ** 2, intensity, (sign * (p.conj() * vz).real, np.abs(vz) ** 2),

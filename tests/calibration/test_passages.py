@@ -59,6 +59,8 @@ def test_what_is_heard_left_the_ship_earlier():
     distance = np.hypot(6000.0, heard.north_m[0, 0])
     assert elapsed + distance / SOUND == pytest.approx(900.0, abs=1e-3)
     assert elapsed < 900.0 - 5.0
+    assert heard.east_mps[0] == pytest.approx(0.0, abs=1e-9)
+    assert heard.north_mps[0] == pytest.approx(10.0)
 
 
 def test_the_nearest_ship_comes_first_and_is_alone_only_where_the_next_is_far():
