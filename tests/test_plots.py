@@ -505,3 +505,17 @@ def test_colours_survive_print_in_grey():
     np.testing.assert_allclose(cyclic(0.0), cyclic(1.0), atol=0.02)
     looks = {tuple(style.track_style(n).values()) for n in range(15)}
     assert len(looks) == 15
+
+
+def test_nothing_is_laid_over_a_map_that_is_not_there(table):
+    half = make_run(table, [track_of(COURSE)], parts=("azimuth",))
+    made = report(half, reference=[reference_of(COURSE)])
+    (ax,) = [ax for ax in made.axes if ax.get_ylabel() == "range [km]"]
+    assert not any(len(line.get_xdata()) for line in ax.lines)
+
+
+def test_a_run_without_tracking_does_not_claim_that_no_ship_was_found(table):
+    untracked = make_run(table, [], hours=1.0)
+    untracked.info["seconds"] = {"detect": 1.0}
+    said = " ".join(texts(report(untracked)))
+    assert "detections only" in said and "no ship" not in said

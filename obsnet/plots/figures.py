@@ -197,7 +197,7 @@ def _rate_panel(ax: Axes, run: Run, start: float, end: float, reference: Referen
 
 
 def _over(
-    ax: Axes, run: Run, columns: Columns, reference: Reference, kind: overlay.Kind, size: float = 2.8
+    ax: Axes, run: Run, columns: Columns, reference: Reference, kind: overlay.Kind, size: float | None = None
 ) -> None:
     overlay.curves(ax, run, reference, kind, columns.start, columns.end)
     overlay.detections(ax, run, kind, columns.start, columns.end, size)

@@ -23,6 +23,8 @@ from obsnet.trackers.track import Track
 Kind = Literal["azimuth", "range"]
 NUMBERED = 12
 """With more tracks than this in a picture, numbers would hide it."""
+CROWDED = 1500
+"""With more detections than this in a panel, each mark is small."""
 SPARSE = 40
 """With more AIS reports than this in a picture, the course is known everywhere."""
 APPROACH, DEPARTURE, UNKNOWN = style.PURPLE, style.ORANGE, "#999999"
@@ -72,9 +74,10 @@ def reference_heard(ship: ReferenceTrack, delay: Callable, start: float, end: fl
     return Curve(time, *ship.heard(time, delay))
 
 
-def detections(ax: Axes, run: Run, kind: Kind, start: float, end: float, size: float = 2.8) -> None:
-    """Each minute's azimuth or range."""
+def detections(ax: Axes, run: Run, kind: Kind, start: float, end: float, size: float | None = None) -> None:
+    """Each minute's azimuth or range, in marks of `size` points: smaller ones where there are many."""
     time, values, _ = _detected(run, kind, start, end)
+    size = size or (2.8 if len(time) < CROWDED else 1.4)
     ax.plot(time, values, "o", ms=size, mfc="white", mec="black", mew=0.4, ls="", zorder=3)
 
 
@@ -91,12 +94,14 @@ def detections_by_rate(ax: Axes, run: Run, start: float, end: float, size: float
 
 
 def curves(ax: Axes, run: Run, reference: list[ReferenceTrack], kind: Kind, start: float, end: float) -> None:
-    """Tracks and AIS as heard."""
+    """Tracks and AIS as heard; nothing where the run has no map to lay them over."""
+    if f"{kind}_llr" not in run.maps:
+        return
     delay = travel_time(run.table)
     here = [(n, track) for n, track in enumerate(run.tracks) if track.end > start and track.start < end]
     for number, track in here:
         time, values = heard(track, delay).on(kind)
-        ax.plot(time, values, lw=1.3, zorder=4, **style.track_style(number))
+        ax.plot(time, values, lw=1.3 if len(here) <= NUMBERED else 0.8, zorder=4, **style.track_style(number))
         if len(run.tracks) > 1 and len(here) <= NUMBERED:
             low, high = ax.get_ylim()
             inside = (
@@ -115,6 +120,8 @@ def reports(
     ax: Axes, run: Run, reference: list[ReferenceTrack], kind: Kind, start: float, end: float
 ) -> None:
     """AIS reports themselves where they are sparse, at the time at which the ship there is heard."""
+    if f"{kind}_llr" not in run.maps:
+        return
     delay = travel_time(run.table)
     for ship in reference:
         azimuth, distance, rate = ship.observables(ship.time)

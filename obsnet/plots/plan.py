@@ -54,18 +54,25 @@ def close_up(ax: Axes, track: Track, number: int, reference: list[ReferenceTrack
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=7)
     style.y_axis(ax, "", centre[1] - reach, centre[1] + reach, most=3)
     motion = track.motion
-    _draw_track(ax, track, number, motion.cpa_time + 2e3 * reach / motion.speed_mps * np.array([-1.0, 1.0]))
+    _draw_track(
+        ax, track, number, motion.cpa_time + 2e3 * reach / max(motion.speed_mps, 0.1) * np.array([-1.0, 1.0])
+    )
     ax.plot(*centre, "o", ms=4, mfc="white", mec="black", zorder=6)
     for ship in reference:
         _reference(ax, ship, motion.cpa_time - 7200.0, motion.cpa_time + 7200.0)
         east, north, _ = ship.at(motion.cpa_time)
         ax.plot(east / 1e3, north / 1e3, "x", ms=5, color="black", mew=1.2, zorder=6)
-    ax.set_title(f"{number + 1}: closest approach [km]", fontsize=8, pad=3)
+    ax.set_title(f"CPA of track {number + 1} [km]", fontsize=8, pad=3)
 
 
 def reach_km(tracks: list[Track], reference: list[ReferenceTrack], start: float, end: float) -> float:
     """Half-width of the view: what holds all tracks, or all AIS without any; 5 to 100 km."""
-    farthest = [float(np.hypot(*track.positions(300.0)[1:]).max()) for track in tracks]
+    farthest = [
+        float(np.hypot(*track.positions(300.0)[1:]).max())
+        if np.isfinite(track.std[2])
+        else 2.0 * abs(track.motion.cpa_range_m)
+        for track in tracks
+    ]
     if not farthest:
         time = np.linspace(start, end, 200)
         away = [np.hypot(*ship.at(time)[:2]) for ship in reference]

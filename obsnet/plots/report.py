@@ -50,9 +50,7 @@ def report(run: Run, path: str | Path | None = None, reference: list[ReferenceTr
         title = f"{run.station.code}: no minute of data"
         style.say(style.box(made, _LEFT, 0.6, _PAGE[0] - 2 * _LEFT, _PAGE[1] - 1.4), "no minute of data")
     else:
-        count = len(run.tracks)
-        found = f"{count} ship{'s' if count > 1 else ''} found" if count else "no ship found"
-        title = f"{run.station.code}, {style.span(columns.start, columns.end)}: {found}"
+        title = f"{run.station.code}, {style.span(columns.start, columns.end)}: {_found(run)}"
         _fill(made, run, reference or [], columns)
     style.title(made, title)
     if path is not None:
@@ -93,15 +91,25 @@ def _fill(made: Figure, run: Run, reference: list[ReferenceTrack], columns: Colu
         close_up(style.box(made, 9.35 + 1.5 * place, 0.35, 1.2, 1.2), track, number, reference)
 
 
+def _found(run: Run) -> str:
+    count = len(run.tracks)
+    if "track" not in run.info.get("seconds", {"track": 0.0}):
+        return "detections only"
+    return f"{count} ship{'s' if count > 1 else ''} found" if count else "no ship found"
+
+
 def _legend(ax: Axes, run: Run, reference: list[ReferenceTrack]) -> None:
     handles = overlay.handles(run, reference)
     handles.insert(
         0, Line2D([], [], marker="*", ms=10, mfc=style.YELLOW, mec="black", ls="", label="station")
     )
     handles.append(Line2D([], [], marker=".", ms=5, color="#888888", ls="", label="detection on the plan"))
-    if run.tracks:
-        patch = {"fc": style.track_style(0)["color"], "ec": "black", "alpha": 0.55}
-        handles.append(Patch(label="90 % at closest approach", **patch))
+    colour = style.track_style(0)["color"]
+    observed = [bool(np.isfinite(track.std[2])) for track in run.tracks]
+    if any(observed):
+        handles.append(Patch(fc=colour, ec="black", alpha=0.55, label="90 % at closest approach"))
+    if not all(observed):
+        handles.append(Line2D([], [], color=colour, ls=":", label="distance at CPA, course unknown"))
     ax.legend(handles=handles, loc="upper left", ncols=2, fontsize=8.5, frameon=False, borderaxespad=0)
 
 
