@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -61,17 +62,21 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML file, interpolations resolved, into plain containers."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
+    from yaml import YAMLError, safe_load
 
     try:
-        plain = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        text = Path(path).read_text(encoding="utf-8")
+        found = safe_load(text)
+        plain = (
+            OmegaConf.to_container(OmegaConf.create(text), resolve=True) if isinstance(found, dict) else {}
+        )
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (OmegaConfBaseException, YAMLError, UnicodeDecodeError, ValueError) as error:
-        line = " ".join(str(error).split())
+    except (OmegaConfBaseException, YAMLError, ValueError, RecursionError) as error:
+        line = " ".join(str(error).split())[:300]
         raise ConfigError(f"{path} is not a valid YAML configuration: {line}") from None
-    if not isinstance(plain, dict):
-        raise ConfigError(f"{path} must hold a mapping of keys, found a {type(plain).__name__}")
+    if not isinstance(plain, dict) or not isinstance(found, dict | None):
+        raise ConfigError(f"{path} must hold a mapping of keys, found a {type(found).__name__}")
     return {str(key): value for key, value in plain.items()}
 
 
@@ -79,14 +84,15 @@ def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str
     """Values with `section.key=value` overrides laid over them."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
     for override in overrides:
-        if "=" not in override:
+        if not re.match(r"\w+(\.\w+)*=", override):
             raise ConfigError(f"override '{override}' must read section.key=value")
     try:
         merged = OmegaConf.merge(OmegaConf.create(dict(values)), OmegaConf.from_dotlist(overrides))
         plain = OmegaConf.to_container(merged, resolve=True)
-    except (OmegaConfBaseException, ValueError) as error:
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
         raise ConfigError(
             f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}"
         ) from None

@@ -5,6 +5,7 @@ Times inside arrays are `datetime64[ns]` UTC; `UTCDateTime` stays in `obsnet.sig
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from obsnet.errors import LayoutError
+
+_ISO_8601 = re.compile(
+    r"(?P<time>\d{4}(-\d\d(-\d\d(?P<clock>[T ]\d\d(:\d\d(:\d\d(\.\d+)?)?)?)?)?)?)"
+    r"(\s*[Zz]|(?P<sign>[+-])(?P<hours>\d\d):?(?P<minutes>\d\d))?"
+)
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,25 @@ def from_posix(seconds: npt.ArrayLike) -> np.ndarray:
     array(['1970-01-01T00:01:00.000000000'], dtype='datetime64[ns]')
     """
     return np.rint(np.asarray(seconds, float) * 1e9).astype("int64").astype("datetime64[ns]")
+
+
+def parse_utc(text: str) -> int:
+    """Nanoseconds since 1970-01-01 UTC of ISO 8601 text; without an offset the time is UTC.
+
+    Raises
+    ------
+    ValueError
+        The text is no ISO 8601 time, or lies outside the years 1678 to 2261, which ns since 1970 can hold.
+
+    >>> parse_utc("1970-01-01T00:00:10.24Z") == parse_utc("1970-01-01T02:00:10.24+02:00")
+    True
+    """
+    parts = _ISO_8601.fullmatch(text.strip())
+    if parts is None or (parts["sign"] and not parts["clock"]) or not 1678 <= int(text.strip()[:4]) <= 2261:
+        raise ValueError(f"{text!r} is no ISO 8601 time of the years 1678 to 2261")
+    sign, hours, minutes = parts["sign"], int(parts["hours"] or 0), int(parts["minutes"] or 0)
+    offset_s = (-1 if sign == "-" else 1) * (3600 * hours + 60 * minutes)
+    return int(np.datetime64(parts["time"], "ns").astype(np.int64)) - offset_s * 1_000_000_000
 
 
 def iso(time: np.datetime64 | float) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 import obspy
 
 from obsnet.errors import StationError
+from obsnet.layout import parse_utc
 
 
 def describe(source: Any) -> str:
@@ -43,6 +44,8 @@ def read(source: Any) -> Any:
             return obspy.read_inventory(BytesIO(content), format="STATIONXML")
         except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
             detail = " ".join(str(error).split())[:120] or type(error).__name__
+            if b"<FDSNStationXML" not in content and b":FDSNStationXML" not in content:
+                detail = "it has no FDSNStationXML element; give the station's StationXML"
             raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None
 
 
@@ -85,8 +88,11 @@ def seconds(time: Any, default: float) -> float:
     if hasattr(time, "timestamp") and not callable(time.timestamp):
         return float(time.timestamp)
     try:
-        text = time.rstrip("Z") if isinstance(time, str) else time
-        return float(np.datetime64(text, "ns").astype("int64")) / 1e9
+        if isinstance(time, str):
+            return parse_utc(time) / 1e9
+        if np.isnat(stamp := np.datetime64(time, "ns")):
+            raise ValueError
+        return float(stamp.astype("int64")) / 1e9
     except (ValueError, TypeError):
         raise StationError(
             f"cannot read the time {time!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"

@@ -17,7 +17,7 @@ import numpy as np
 import obspy
 
 from obsnet.errors import WaveformError
-from obsnet.layout import iso
+from obsnet.layout import iso, parse_utc
 from obsnet.signals.files import FileReader, list_files, trace_piece
 from obsnet.signals.records import RecordReader
 from obsnet.signals.station import Station
@@ -180,7 +180,9 @@ def to_ns(time: Any) -> int:
     if isinstance(time, (int, float)) and not isinstance(time, bool):
         return round(time * _SECOND)
     try:
-        stamp = np.datetime64(time.rstrip("Z") if isinstance(time, str) else time, "ns")
+        if isinstance(time, str):
+            return parse_utc(time)
+        stamp = np.datetime64(time, "ns")
         if np.isnat(stamp):
             raise ValueError
         return int(stamp.astype(np.int64))
@@ -211,6 +213,8 @@ def _paths(source: Any) -> list[str | Path]:
     paths = [source] if isinstance(source, (str, Path)) else source
     if not isinstance(paths, (list, tuple)) or not all(isinstance(path, (str, Path)) for path in paths):
         raise WaveformError(f"obsnet takes paths or an obspy Stream, found {type(source).__name__}")
+    if not all(str(path).strip() for path in paths):
+        raise WaveformError("a path of waveforms is empty text; name files, folders or an archive")
     return list(paths)
 
 

@@ -16,7 +16,7 @@ from obspy.core.inventory import Inventory
 
 from obsnet import ais as positions
 from obsnet.errors import AISError, ConfigError
-from obsnet.layout import iso, to_posix
+from obsnet.layout import iso, parse_utc
 from obsnet.ocean.rays import propagation_table
 from obsnet.signals.station import Station
 from obsnet.twin.course import Course
@@ -43,6 +43,7 @@ __all__ = [
 
 BLOCK_S = 3600.0
 CONTEXT_S = 150.0
+LONGEST_H = 100_000.0
 Progress = Callable[[float, float], None]
 
 
@@ -184,6 +185,11 @@ def simulate_folder(
         A time that cannot be read, AIS without a ship near the station, bad metadata, a folder that cannot be
         written.
     """
+    if not (np.isfinite(hours) and 0 < hours <= LONGEST_H):
+        raise ConfigError(f"hours must lie between 0 and {LONGEST_H:g}, found {hours:g}")
+    if seed < 0 or ships < 0:
+        name, value = ("seed", seed) if seed < 0 else ("number of ships", ships)
+        raise ConfigError(f"the {name} must be a whole number of at least 0, found {value}")
     generator = np.random.default_rng([seed, 0x57A])
     recorder = Recorder.random(generator, **_described(station))  # type: ignore[arg-type]
     begin = _seconds(start) if start else None
@@ -215,7 +221,7 @@ def _described(station: str | Path | None) -> dict[str, object]:
 
 def _seconds(text: str) -> float:
     try:
-        return float(to_posix(np.datetime64(text.removesuffix("Z"), "ns")))
+        return parse_utc(text) / 1e9
     except ValueError:
         raise ConfigError(
             f"cannot read the start {text!r}; give ISO 8601, e.g. 2013-05-21T10:00:00Z"
