@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.signal
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.path import Path as Outline
@@ -25,6 +26,7 @@ from obsnet.plots.columns import Columns, range_columns
 from obsnet.plots.envelope import RANGE_STEP_M, observed_envelope
 from obsnet.plots.figures import DAY_ROWS, MOST_COLUMNS, MOST_TRACKS, day_rows, figure
 from obsnet.plots.overlay import heard, reference_heard
+from obsnet.plots.panels import analytic_signal
 from obsnet.plots.plan import ellipse
 from obsnet.run import Run, read_run
 from obsnet.signals.station import Station
@@ -409,6 +411,12 @@ def test_observed_envelope_stacks_minutes_at_the_range_heard(table):
     assert np.isnan(envelope.sel(range=5e3)).all()
     known = observed_envelope(run, [reference_of(COURSE)], grid).sel(quefrency=3.0, method="nearest")
     assert float(known.idxmax("range")) == 20e3
+
+
+@pytest.mark.parametrize("count", [512, 513])
+def test_analytic_signal_is_scipys(count):
+    values = np.random.default_rng(4).normal(size=(3, count))
+    np.testing.assert_allclose(analytic_signal(values), scipy.signal.hilbert(values, axis=1), atol=1e-12)
 
 
 def test_run_comes_back_from_its_folder(run, written):

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from scipy.signal import hilbert
 
-from obsnet.ais import ReferenceTrack
 from obsnet.detectors.analytic import cepstral_model
 from obsnet.layout import to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import parse_pair, tdoa, travel_time
 from obsnet.plots import style
 from obsnet.plots.overlay import heard
-from obsnet.plots.panels import longest_quefrency, squared_envelope, without
+from obsnet.plots.panels import analytic_signal, longest_quefrency, squared_envelope, without
 from obsnet.run import Run
+
+if TYPE_CHECKING:
+    from obsnet.ais import ReferenceTrack
 
 RANGE_STEP_M = 500.0
 """A ship at 8 m/s moves on by as much in a minute."""
@@ -106,7 +109,7 @@ def modelled_envelope(run: Run, quefrency_s: np.ndarray) -> xr.DataArray:
     )
     pulses = cepstral_model(quefrency_s, run.table, amplitudes, run.config.range).sum(axis=0)
     coordinates = {"range": run.config.range.range_m, "quefrency": quefrency_s}
-    return xr.DataArray(np.abs(hilbert(pulses, axis=1)), coordinates, ("range", "quefrency"))
+    return xr.DataArray(np.abs(analytic_signal(pulses)), coordinates, ("range", "quefrency"))
 
 
 def _ranges(run: Run, reference: list[ReferenceTrack], time: np.ndarray) -> np.ndarray:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from obsnet.ais import ReferenceTrack, read, reference_tracks
 from obsnet.errors import ConfigError
 from obsnet.plots import overlay, panels, style
 from obsnet.plots.columns import Columns
 from obsnet.plots.envelope import envelope_figure
 from obsnet.plots.plan import plan_view
 from obsnet.run import Run, read_run
+
+if TYPE_CHECKING:
+    from obsnet.ais import ReferenceTrack
 
 MOST_COLUMNS = 2000
 DAY_ROWS = 8
@@ -24,7 +27,7 @@ MOST_TRACKS = 12
 """Tracks of figure 8, the strongest."""
 _DAY = 86400.0
 _MARGIN_S = 1800.0
-Reference = list[ReferenceTrack]
+Reference: TypeAlias = "list[ReferenceTrack]"
 
 
 def draw(folder: str | Path, figures: Sequence[int], ais: str | Path | None = None) -> list[Path]:
@@ -53,6 +56,8 @@ def draw(folder: str | Path, figures: Sequence[int], ais: str | Path | None = No
     run = read_run(folder)
     reference: Reference = []
     if ais is not None:
+        from obsnet.ais import read, reference_tracks
+
         place = run.station.latitude, run.station.longitude
         reference = reference_tracks(read(ais, near=place, within_m=500e3), run.station)
     return [style.save(figure(run, n, reference), Path(folder) / f"figure-{n}.png") for n in figures]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,12 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from obsnet.ais import ReferenceTrack
 from obsnet.layout import to_posix
 from obsnet.ocean.rays import travel_time
 from obsnet.plots import style
 from obsnet.run import Run
 from obsnet.trackers.track import Track
+
+if TYPE_CHECKING:
+    from obsnet.ais import ReferenceTrack
 
 Kind = Literal["azimuth", "range"]
 NUMBERED = 12

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.fft
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.image import AxesImage
-from scipy.signal import hilbert
 
 from obsnet.ocean.rays import tdoa
 from obsnet.plots import style
@@ -109,8 +109,20 @@ def image(
 
 def squared_envelope(cepstra: np.ndarray) -> np.ndarray:
     """Squared modulus of the analytic signal along quefrency, of cepstra (minute, quefrency)."""
-    analytic = hilbert(cepstra, axis=1)
+    analytic = analytic_signal(cepstra)
     return (analytic.real**2 + analytic.imag**2).astype(np.float32)
+
+
+def analytic_signal(values: np.ndarray) -> np.ndarray:
+    """Analytic signal along the last axis: positive frequencies doubled, negative ones left out.
+
+    As scipy.signal.hilbert, which takes a quarter of a second to import.
+    """
+    count = values.shape[-1]
+    spectrum = scipy.fft.fft(values, axis=-1)
+    spectrum[..., 1 : (count + 1) // 2] *= 2.0
+    spectrum[..., count // 2 + 1 :] = 0.0
+    return scipy.fft.ifft(spectrum, axis=-1)
 
 
 def farthest_km(run: Run) -> float:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from matplotlib.axes import Axes
 
-from obsnet.ais import ReferenceTrack
 from obsnet.layout import to_posix
 from obsnet.plots import style
 from obsnet.plots.overlay import NUMBERED, draw_reference
 from obsnet.run import Run
 from obsnet.trackers.track import Track
+
+if TYPE_CHECKING:
+    from obsnet.ais import ReferenceTrack
 
 NINETY_PERCENT = 4.605
 """90 % quantile of χ² with two degrees of freedom."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,11 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from obsnet.ais import ReferenceTrack
 from obsnet.plots import overlay, panels, style
 from obsnet.plots.columns import Columns
 from obsnet.plots.plan import close_up, plan_view
 from obsnet.run import Run
+
+if TYPE_CHECKING:
+    from obsnet.ais import ReferenceTrack
 
 _COLUMNS = 740
 _PAGE = (13.6, 9.4)
