@@ -149,7 +149,7 @@ class ClickRecord:
 
 def process(
     wav: str | Path | tuple[float, np.ndarray],
-    geometry: CompactArray,
+    geometry: CompactArray | str | Path | np.ndarray,
     config: ClickConfig | None = None,
     starttime: float = 0.0,
 ) -> ClickRecord:
@@ -158,7 +158,8 @@ def process(
     Parameters
     ----------
     wav : path of a multichannel WAV file, or (sampling rate [Hz], samples (hydrophone, time)).
-    geometry : CompactArray, one hydrophone a channel.
+    geometry : CompactArray, its YAML file, or positions (hydrophone, (east, north, depth)) in m; one
+        hydrophone a channel. An array at or above the surface has no echoes.
     starttime : time of the first sample, s since 1970.
 
     Raises
@@ -169,6 +170,7 @@ def process(
         A parameter does not fit the recording's sampling rate.
     """
     config = config or ClickConfig()
+    geometry = CompactArray.of(geometry)
     recording = Recording.of(wav)
     if config.channels is not None:
         recording = recording.select(config.channels)

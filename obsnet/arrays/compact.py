@@ -56,6 +56,27 @@ class CompactArray:
             )
 
     @classmethod
+    def of(cls, geometry: CompactArray | str | Path | np.ndarray) -> CompactArray:
+        """An array as it is, from its YAML file, or from positions (hydrophone, (east, north, depth)) in
+        m.
+        """
+        if isinstance(geometry, cls):
+            return geometry
+        if isinstance(geometry, (str, Path)):
+            return cls.read(geometry)
+        try:
+            positions = np.asarray(geometry, float)
+        except (TypeError, ValueError):
+            positions = np.empty(0)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ConfigError(
+                "an array's geometry is a CompactArray, a YAML file or positions with dims "
+                f"(hydrophone, (east, north, depth)), found {type(geometry).__name__} of shape {positions.shape}"
+            )
+        east, north, depth = positions.T.tolist()
+        return cls(tuple(east), tuple(north), tuple(depth))
+
+    @classmethod
     def read(cls, path: str | Path) -> CompactArray:
         """Array described by a YAML file whose keys are this class's attributes."""
         return build(cls, read_yaml(path), str(path))

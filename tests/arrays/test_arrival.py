@@ -191,6 +191,10 @@ def test_an_array_is_read_from_yaml(tmp_path):
     path.write_text("east_m: [0, 1, 0]\nnorth_m: [0, 0, 1]\ndepth_m: [20, 20, 21]\nsound_speed_mps: 1480\n")
     array = CompactArray.read(path)
     assert array.count == 3 and array.sound_speed_mps == 1480.0 and array.depth_m[2] == 21.0
+    assert CompactArray.of(path) == array == CompactArray.of(array)
+    assert CompactArray.of(array.positions).depth_m == array.depth_m
+    with pytest.raises(ConfigError, match="an array's geometry is a CompactArray"):
+        CompactArray.of(np.zeros((4, 2)))
     path.write_text("east: [0, 1, 0]\n")
     with pytest.raises(ConfigError, match="unknown key"):
         CompactArray.read(path)

@@ -3,6 +3,7 @@ import pytest
 from scipy.io import wavfile
 
 from obsnet.arrays.clicks import ClickConfig, ClickMapConfig, CompactArray, DetectorConfig, process
+from obsnet.config import build
 from obsnet.errors import ConfigError, WaveformError
 from obsnet.kinematics import wrap180
 
@@ -137,3 +138,15 @@ def test_parameters_out_of_range_are_named():
     ):
         with pytest.raises(ConfigError, match=message):
             ClickConfig(**values)
+
+
+def test_the_configuration_is_built_from_plain_values():
+    values = {
+        "detector": {"min_hydrophones": 3, "margin": 0.1},
+        "channels": [2, 1, 4, 3],
+        "interpolation": "none",
+    }
+    config = build(ClickConfig, values)
+    assert (config.channels, config.detector.margin, config.interpolation) == ((2, 1, 4, 3), 0.1, "none")
+    with pytest.raises(ConfigError, match="interpolation must be one of none, parabolic, upsampled"):
+        build(ClickConfig, {"interpolation": "cubic"})
