@@ -46,6 +46,8 @@ __all__ = [
 
 FLUX_SIGNIFICANCE = 3.0
 MAX_STD_DEG = 15.0
+UNKNOWN_PLACE_M = 300.0
+"""How far a station may have drifted while it sank, standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -211,10 +213,11 @@ def _place_and_turn(
 ) -> tuple[Position | None, Rotation | None]:
     """Place of the station and rotation of its azimuths there; the azimuths choose between mirror images."""
 
-    def turn(shift_m: tuple[float, float]) -> Rotation | None:
+    def turn(shift_m: tuple[float, float], std_m: float) -> Rotation | None:
         return rotation(
             passages,
             shift_m,
+            std_m,
             average_s=config.average_s,
             min_snr_db=config.min_snr_db,
             min_range_m=config.min_range_m,
@@ -222,11 +225,13 @@ def _place_and_turn(
         )
 
     places = locate(branches, amplitudes, config.search_m, config.search_step_m)
-    turns = [turn((place.east_m, place.north_m)) for place in places]
+    turns = [
+        turn((place.east_m, place.north_m), max(place.east_std_m, place.north_std_m)) for place in places
+    ]
     fits = [found.log_likelihood if found else -np.inf for found in turns]
     if not places or (len(places) > 1 and not np.isfinite(fits).any()):
         notes.append("the cepstral branches do not determine the position; it is left as it was")
-        return None, turn((0.0, 0.0))
+        return None, turn((0.0, 0.0), UNKNOWN_PLACE_M)
     best = int(np.argmax(fits))
     offset = places[best]
     latitude, longitude = moved(station, offset.east_m, offset.north_m)

@@ -19,7 +19,6 @@ OUTLIERS = 0.3
 BLOCK_S, BAND_HZ = 900.0, 1.0
 FLUX_BLOCK_S = 180.0
 MIN_CELLS = 50
-POSITION_ERROR_M = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +39,14 @@ class Rotation:
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """Time–frequency cells that stand out: AIS azimuth minus heard azimuth [deg] for each ship and how likely
-    it is that ship's, (cell, ship); concentration, frequency bin and stretch, (cell).
+    it is that ship's, (cell, ship); concentration, error of the azimuth from the place [rad], frequency bin and
+    stretch, (cell).
     """
 
     difference: np.ndarray
     share: np.ndarray
     concentration: np.ndarray
+    tilt: np.ndarray
     frequency: np.ndarray
     block: np.ndarray
 
@@ -53,6 +54,7 @@ class _Cells:
 def rotation(
     passages: Passages,
     offset_m: tuple[float, float],
+    offset_std_m: float,
     *,
     average_s: float,
     min_snr_db: float,
@@ -65,13 +67,14 @@ def rotation(
     within the cell. A share ε of cells points anywhere, the others to one of the known ships with its share s
     of the power that spherical spreading brings: the likelihood of a rotation φ is Π (ε + (1 − ε) Σ s 2π WC(d
     − φ; R)). Its standard deviation is the jackknife's, over stretches of 15 min (AIS, background) and over
-    bands of 1 Hz (coupling) in quadrature.
+    bands of 1 Hz (coupling), and what `offset_std_m` of the station's place turns at the ships' ranges, in
+    quadrature.
 
     Returns
     -------
     Rotation, or none where no cell stands out or the station has no two horizontals.
     """
-    cells = _cells(passages, offset_m, average_s, min_snr_db, min_range_m, max_range_m)
+    cells = _cells(passages, offset_m, offset_std_m, average_s, min_snr_db, min_range_m, max_range_m)
     if cells is None or cells.frequency.size < MIN_CELLS:
         return None
     coarse = np.arange(-180.0, 180.0, COARSE_DEG)
@@ -81,7 +84,8 @@ def rotation(
     band = np.floor(passages.frequency[cells.frequency] / BAND_HZ).astype(int)
     blocks, bands = (_log_likelihood(cells, fine, group) for group in (cells.block, band))
     best = _mode(blocks.sum(axis=0), fine)
-    std = np.hypot(_jackknife(blocks, fine), _jackknife(bands, fine))
+    tilt = np.rad2deg(np.median(cells.tilt)) / np.sqrt(np.unique(passages.heard.passage).size)
+    std = np.sqrt(_jackknife(blocks, fine) ** 2 + _jackknife(bands, fine) ** 2 + tilt**2)
     counts = np.bincount(band)
     listed = tuple(
         (float((k + 0.5) * BAND_HZ), _wrap(_mode(bands[k], fine)), int(counts[k]))
@@ -121,6 +125,7 @@ def downward_flux(passages: Passages) -> float | None:
 def _cells(
     passages: Passages,
     offset_m: tuple[float, float],
+    offset_std_m: float,
     average_s: float,
     min_snr_db: float,
     min_range_m: float,
@@ -151,13 +156,14 @@ def _cells(
     snr = snr / passages.background[:, None] - 1.0
     loud = snr >= 10.0 ** (min_snr_db / 10.0)
     frequency, column = np.nonzero(loud)
-    tilt = np.minimum(POSITION_ERROR_M / distance[first, 0][column], 1.0)
+    tilt = np.minimum(offset_std_m / distance[first, 0][column], 1.0)
     spread = 1.0 / np.sqrt(snr[loud] * count[column]) + tilt
     level = distance[first][column] ** -2.0
     return _Cells(
         azimuth[first][column] - np.rad2deg(np.angle(mean[loud]))[:, None],
         level / level.sum(axis=1, keepdims=True),
         np.clip(focus[loud] * (1.0 - spread), 0.2, 0.97),
+        tilt,
         frequency,
         heard.blocks(BLOCK_S)[first][column],
     )

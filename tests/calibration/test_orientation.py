@@ -58,8 +58,10 @@ def passages(turn_deg, courses=((6000.0, 1.0),), directed=0.6, seed=0, snr=30.0,
     )  # fmt: skip
 
 
-def found(given, offset=(0.0, 0.0)):
-    return rotation(given, offset, average_s=60.0, min_snr_db=6.0, min_range_m=2000.0, max_range_m=40e3)
+def found(given, offset=(0.0, 0.0), std_m=30.0):
+    return rotation(
+        given, offset, std_m, average_s=60.0, min_snr_db=6.0, min_range_m=2000.0, max_range_m=40e3
+    )
 
 
 def off(angle, truth):
@@ -122,3 +124,10 @@ def test_gaps_cost_only_themselves():
     broken = replace(given, power=power, intensity=intensity)
     assert off(found(broken).angle_deg, 30.0) < 1.0
     assert downward_flux(replace(broken, vertical=(np.where(np.isnan(power), np.nan, flux), motion))) > 5.0
+
+
+def test_an_uncertain_place_makes_an_uncertain_orientation():
+    given = passages(30.0)
+    sure, unsure = found(given, std_m=10.0), found(given, std_m=400.0)
+    assert unsure.std_deg > 1.5 > sure.std_deg
+    assert off(unsure.angle_deg, 30.0) < 1.0
