@@ -31,13 +31,14 @@ class Line:
 
     @property
     def noise(self):
-        return np.array([[self.std**2]])
+        return np.eye(self.channels) * self.std**2
 
     def dynamics(self, interval_s, mean):
         return constant_velocity(interval_s, 1, np.full((*mean.shape[:-1], 1), 0.1))
 
     def observe(self, mean):
-        return mean[..., :1], np.broadcast_to([[1.0, 0.0]], (*mean.shape[:-1], 1, 2))
+        slopes = np.tile([[1.0, 0.0]], (self.channels, 1))
+        return mean @ slopes.T, np.broadcast_to(slopes, (*mean.shape[:-1], self.channels, 2))
 
     def innovation(self, value, predicted):
         return value - predicted
@@ -93,38 +94,50 @@ def test_one_hypothesis_is_the_extended_kalman_filter():
     assert len(found.tracks) == 1 and all((owner == 0).all() for owner in found.owner)
 
 
-def enumerate_associations(times, values, start, clutter, clicking, detection=0.98, width=40.0):
+def enumerate_associations(
+    model, times, channels, values, start, clutter, clicking, detection=0.98, width=40.0
+):
     """Every history of one animal among clutter: log evidence over all-clutter, and the best history."""
-    model, histories = Line(), []
-    for choice in itertools.product(*(range(len(v) + 1) for v in values)):
+    lists = [[(-1, *np.flatnonzero(channel == c)) for c in range(model.channels)] for channel in channels]
+    histories = []
+    for choice in itertools.product(*(itertools.product(*options) for options in lists)):
         mean, covariance = start
         total = 0.0
-        for k, pick in enumerate(choice):
+        for k, picks in enumerate(choice):
             transition, drift = model.dynamics(times[k] - times[max(k - 1, 0)], mean)
             mean, covariance = predict(mean, covariance, transition, drift)
-            if pick == 0:
-                total += np.log(1.0 - clicking * detection)
+            taken = [m for m in picks if m >= 0]
+            if not taken:
+                total += np.log(1.0 - clicking + clicking * (1.0 - detection) ** model.channels)
                 continue
-            innovation = np.array([values[k][pick - 1] - mean[0]])
-            mean, covariance, gain = update(mean, covariance, innovation, np.array([[1.0, 0.0]]), model.noise)
-            total += float(gain) + np.log(clicking * detection) - np.log(clutter / width)
+            innovation = np.array([values[k][m] - mean[0] if m >= 0 else np.nan for m in picks])
+            mean, covariance, gain = update(mean, covariance, innovation, model.observe(mean)[1], model.noise)
+            total += float(gain) + np.log(clicking) + len(taken) * np.log(detection / (clutter / width))
+            total += (model.channels - len(taken)) * np.log(1.0 - detection)
         histories.append((total, choice))
     totals = np.array([total for total, _ in histories])
-    return totals.max() + np.log(np.exp(totals - totals.max()).sum()), max(histories)[1]
+    best = max(histories, key=lambda history: history[0])[1]
+    return totals.max() + np.log(np.exp(totals - totals.max()).sum()), [
+        sorted(m for m in p if m >= 0) for p in best
+    ]
 
 
-def test_the_evidence_is_that_of_all_histories_enumerated():
+@pytest.mark.parametrize(("count", "clutter"), [(1, (2, 1, 2, 3, 1)), (2, (1, 0, 2, 1))])
+def test_the_evidence_is_that_of_all_histories_enumerated(count, clutter):
     rng = np.random.default_rng(3)
-    times = np.arange(5.0)
-    values = [np.append(rng.uniform(-4.0, 4.0, n), rng.normal(0.0, 0.7)) for n in (2, 1, 2, 3, 1)]
+    model, times = Line(channels=count), np.arange(float(len(clutter)))
+    values = [np.append(rng.uniform(-4.0, 4.0, n), rng.normal(0.0, 0.7)) for n in clutter]
+    channels = [rng.integers(0, count, len(value)) for value in values]
     start = (np.zeros(2), np.eye(2))
+    priors = ScanConfig(0.9, 0.7, 0.5, (-20.0, 20.0), 0.0)
     config = replace(FOREVER, particles=6000, gate_std=20.0, resample_below=0.0)
-    found = associate(line_scans(times, values), Line(), config, seed=4, initial=[start])
-    exact, best = enumerate_associations(times, values, start, clutter=0.5, clicking=0.9)
+    scans = regular_scans(times, channels, values, count, priors)
+    found = associate(scans, model, config, seed=4, initial=[start])
+    exact, best = enumerate_associations(model, times, channels, values, start, 0.5, 0.9, 0.7)
     assert found.log_evidence == pytest.approx(exact, abs=0.05)
-    taken = [int(np.flatnonzero(owner == 0)[0]) + 1 if (owner == 0).any() else 0 for owner in found.owner]
-    last = max(k for k, pick in enumerate(best) if pick)
-    assert taken[: last + 1] == list(best[: last + 1])
+    taken = [np.flatnonzero(owner == 0).tolist() for owner in found.owner]
+    last = max(k for k, picks in enumerate(best) if picks)
+    assert taken[: last + 1] == best[: last + 1]
 
 
 def test_evidence_does_not_depend_on_the_order_of_two_animals_that_compete():
