@@ -78,8 +78,8 @@ def directions(
     whitening = _whitening(covariance, valid)
     slopes = whitening @ (array.baselines(pairs) / array.sound_speed_mps)
     target = np.einsum("npq,nq->np", whitening, np.where(valid, tdoa, 0.0))
-    rank = _rank(slopes)
-    vector = _descend(slopes, target, _start(slopes, target, rank))
+    start, rank = _start(slopes, target)
+    vector = _descend(slopes, target, start)
     azimuth, elevation = angles(vector)
     chi_squared = _cost(slopes, target, vector)
     freedom = valid.sum(axis=1) - 2
@@ -148,18 +148,15 @@ def _whitening(covariance: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(both, inverse, 0.0) / scale
 
 
-def _rank(slopes: np.ndarray) -> np.ndarray:
-    """Dimensions that the valid pairs span, dims (n,)."""
-    values = np.linalg.svd(slopes, compute_uv=False)
-    return (values > 1e-3 * np.maximum(values[:, :1], 1e-300)).sum(axis=1)
+def _start(slopes: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors to descend from, and the dimensions that the valid pairs span.
 
-
-def _start(slopes: np.ndarray, target: np.ndarray, rank: np.ndarray) -> np.ndarray:
-    """Unit vectors to descend from: the linear least-squares vector, lifted to the sphere.
+    The vector is that of linear least squares, lifted to the sphere.
 
     Hydrophones in a plane leave the component across it free: of the two directions the upper one is taken.
     """
     left, values, axes = np.linalg.svd(slopes, full_matrices=False)
+    rank = (values > 1e-3 * np.maximum(values[:, :1], 1e-300)).sum(axis=1)
     kept = np.arange(values.shape[1]) < rank[:, None]
     gain = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
     linear = np.einsum("nk,nkc->nc", gain * np.einsum("npk,np->nk", left, target), axes)
@@ -171,7 +168,7 @@ def _start(slopes: np.ndarray, target: np.ndarray, rank: np.ndarray) -> np.ndarr
     missing = np.sqrt(np.maximum(1.0 - (linear**2).sum(axis=1), 1e-4))
     lifted = linear + np.where(rank == 2, missing, 0.0)[:, None] * normal
     length = np.linalg.norm(lifted, axis=1, keepdims=True)
-    return np.where(length > 1e-12, lifted / np.maximum(length, 1e-12), np.array([0.0, 1.0, 0.0]))
+    return np.where(length > 1e-12, lifted / np.maximum(length, 1e-12), np.array([0.0, 1.0, 0.0])), rank
 
 
 def _cost(slopes: np.ndarray, target: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -181,7 +178,7 @@ def _cost(slopes: np.ndarray, target: np.ndarray, vector: np.ndarray) -> np.ndar
 
 def _descend(slopes: np.ndarray, target: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Levenberg–Marquardt on the unit sphere, all events at once."""
-    damping = np.full(len(vector), 1e-3)
+    damping = np.full(len(vector), 1e-6)
     cost = _cost(slopes, target, vector)
     for _ in range(ITERATIONS):
         tangent = np.stack(tangent_vectors(*angles(vector)), axis=-1)

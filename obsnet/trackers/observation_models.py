@@ -120,11 +120,9 @@ class TdoaModel:
         return np.abs(value) <= reach[channel]
 
     def born(self, value: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """New animals anywhere on the sphere: least squares, its covariance, and Laplace's approximation of
-        the evidence.
+        """New animals anywhere on the sphere: least squares, and Laplace's approximation of the evidence.
 
-        ∫ N(y; h(α, φ), R) p(α, φ) dα dφ ≈ N(y; h(α̂, φ̂), R) p(α̂, φ̂) 2π |P|^½ with p = cos φ / 4π a
-        steradian.
+        ∫ N(y; h(α, φ), R) p(α, φ) dα dφ ≈ N(y; h(α̂, φ̂), R) p(α̂, φ̂) 2π |P|^½ with p = cos φ / 4π.
         """
         likely = self._linear_misfit(value, noise) < chi2.isf(SCREEN, max(self.channels - 2, 1))
         mean, spread = np.zeros((len(value), 4)), np.broadcast_to(np.eye(4), (len(value), 4, 4)).copy()
@@ -132,18 +130,12 @@ class TdoaModel:
         if not likely.any():
             return mean, spread, evidence
         fit = directions(value[likely], self.array, self.pairs, noise, false_rejection=SCREEN)
-        area = np.log(
-            np.maximum(np.cos(np.deg2rad(fit.elevation_deg)), 1e-3) / (4.0 * np.pi) * np.deg2rad(1.0) ** 2
-        )
-        width = (
-            0.5
-            * np.linalg.slogdet(
-                2.0 * np.pi * np.where(np.isfinite(fit.covariance), fit.covariance, np.eye(2))
-            )[1]
-        )
-        norm = _log_volume(value[likely], noise)
-        fitted = np.where(fit.accepted, area + width - 0.5 * (fit.chi_squared + norm), -np.inf)
-        evidence[likely] = fitted
+        level = np.maximum(np.cos(np.deg2rad(fit.elevation_deg)), 1e-3)
+        prior = np.log(level / (4.0 * np.pi) * np.deg2rad(1.0) ** 2)
+        width = np.where(np.isfinite(fit.covariance), fit.covariance, np.eye(2))
+        volume = np.linalg.slogdet(2.0 * np.pi * width)[1] - _log_volume(value[likely], noise)
+        fitted = prior + 0.5 * (volume - fit.chi_squared)
+        evidence[likely] = np.where(fit.accepted, fitted, -np.inf)
         mean[likely, 0], mean[likely, 1] = np.nan_to_num(fit.azimuth_deg), np.nan_to_num(fit.elevation_deg)
         spread[likely, :2, :2] = np.nan_to_num(fit.covariance, nan=1.0)
         level = np.maximum(np.cos(np.deg2rad(mean[:, 1])), 0.05)
@@ -152,9 +144,7 @@ class TdoaModel:
         return mean, spread, evidence
 
     def _linear_misfit(self, value: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Cheap screen for `born`: misfit of complete TDOAs to the linear vector, and of its length to
-        one.
-        """
+        """Cheap screen for `born`: misfit of complete TDOAs to a vector, and of its length to one."""
         slopes = self.array.baselines(self.pairs) / self.array.sound_speed_mps
         complete = np.isfinite(value).all(axis=1)
         if self.array.dimension < 3 or not complete.all():
