@@ -1,5 +1,4 @@
-"""Azimuth and range maps of a station together, row by row, in; existence, position and velocity of one
-ship out, live.
+"""Azimuth and range maps of a station, row by row, in; existence, position and velocity of one ship out, live.
 
 Beyond the track-before-detect paper: its Bernoulli filter (see `bernoulli_filter`) over (east, north) [m]
 and their rates [m/s]. A minute in which only one of the two maps speaks still counts. The sound's travel

@@ -130,6 +130,7 @@ def test_the_result_holds_what_the_report_needs(small, tmp_path):
     assert report["held"]["TVAR14"] > 0.95 and report["false_tracks"]["TVAR14"] == 0.0
     assert report["azimuth_rmse_deg"]["TVAR14"] < 3.0
     assert report["snr_bias_db"]["CFAR"] is None
+    assert report["beyond_the_paper"]["false_tracks"] == {}
     assert "paper" in small.table() and "simulated" in small.table()
     small.plot(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 20_000
