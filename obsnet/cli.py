@@ -8,13 +8,14 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import warnings
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from obsnet import console
 from obsnet.errors import ConfigError, ObsnetError
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="obsnet",
     help="Detect, localise and track ships from a single ocean-bottom station.",
-    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -76,27 +77,43 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     command = typer.main.get_command(app)
-    try:
-        code = command.main(args=arguments, prog_name="obsnet", standalone_mode=False)
-    except ObsnetError as error:
-        _fail(str(error))
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(0)
-    except Exception as error:
-        if not hasattr(error, "format_message"):
-            raise
-        message = error.format_message()
-        if not message:
+    with warnings.catch_warnings(), console.terminable():
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")
+        try:
+            code = command.main(args=arguments, prog_name="obsnet", standalone_mode=False)
+            console.flush()
+        except (KeyboardInterrupt, typer.Abort):
+            sys.exit(130)
+        except BrokenPipeError:
+            console.hush()
+            sys.exit(0)
+        except Exception as error:
+            line = _line(error)
+            if line is None:
+                raise
+            print(f"obsnet: error: {line}", file=sys.stderr)
             sys.exit(2)
-        _fail(message)
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _fail(message: str) -> NoReturn:
-    print("obsnet: error: " + " ".join(message.split()), file=sys.stderr)
-    sys.exit(2)
+def _line(error: Exception) -> str | None:
+    """What to tell the user in one line; nothing where the error is a defect of ours."""
+    text = str(error)
+    if isinstance(error, OSError) and not isinstance(error, ObsnetError):
+        if error.errno is None:
+            return None
+        text = (
+            f"{error.strerror}: {error.filename or 'while reading or writing'}; make room or check the path"
+        )
+    elif isinstance(error, MemoryError):
+        text = "this needs more memory than there is; give a shorter span or coarser grids"
+    elif hasattr(error, "format_message"):
+        command = getattr(error, "ctx", None)
+        text = f"{error.format_message().rstrip('.')}; see {command.command_path if command else 'obsnet'} --help"
+    elif not isinstance(error, ObsnetError):
+        return None
+    return " ".join(text.split())
 
 
 @app.command()
@@ -207,8 +224,9 @@ def _track(
     jobs: int | None = None,
     quiet: bool = False,
     tracking: bool = True,
-) -> Run:
+) -> None:
     import obsnet.run as runs
+    from obsnet.output import staged
 
     settings = _run_config(config, overrides, detector, tracker)
     station = _station(
@@ -219,18 +237,17 @@ def _track(
     station = fitted.apply(station) if fitted else station
     reference = _reference(ais, station) if ais else None
     table = _table(propagation)
-    runs.prepare_folder(out)
-    with _progress("reading and detecting", quiet) as progress:
-        task = runs.track if tracking else runs.detect
-        run = task(
-            waveforms, station, settings, starttime=start, endtime=end, folder=out, threads=jobs, progress=progress,
-            amplitudes=fitted.amplitudes if fitted else None, table=table,
-        )  # fmt: skip
-    runs.write_tables(run, out)
-    run.plot(out / "report.png", reference=reference)
+    with staged(out, leftovers=("live.csv",)) as folder:
+        with console.progress("reading and detecting", quiet) as progress:
+            task = runs.track if tracking else runs.detect
+            run = task(
+                waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
+                progress=progress, amplitudes=fitted.amplitudes if fitted else None, table=table,
+            )  # fmt: skip
+        runs.write_tables(run, folder)
+        run.plot(folder / "report.png", reference=reference)
     if not quiet:
         _summary(run, out)
-    return run
 
 
 def _evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
@@ -238,9 +255,9 @@ def _evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = Fals
 
     evaluation = evaluate_folder(folder, ais)
     if as_json:
-        print(json.dumps(evaluation.to_json()))
+        console.say(json.dumps(evaluation.to_json()))
     elif not quiet:
-        print(evaluation.table())
+        console.say(evaluation.table())
 
 
 def _run_config(
@@ -290,54 +307,24 @@ def _reference(path: Path, station: Station) -> list:
 def _summary(run: Run, out: Path) -> None:
     found = run.detections
     azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
-    print(f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range")
+    console.say(
+        f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range"
+    )
     for note in run.info.get("notes", []):
-        print(f"note: {note}")
+        console.say(f"note: {note}")
     for warning in run.info["waveforms"].get("warnings", []):
-        print(f"note: {warning}")
+        console.say(f"note: {warning}")
     for number, track in enumerate(run.tracks, 1):
         row = track.row(number)
-        print(
+        console.say(
             f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at {row['cpa_distance_m'] / 1000:.2f} ± "
             f"{row['cpa_distance_std_m'] / 1000:.2f} km, azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± "
             f"{row['course_std_deg']:.1f}°, {row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
             f"log Bayes factor {row['log_bayes_factor']:.0f} ({track.method})"
         )
     if not run.tracks:
-        print("no ship found" if "track" in run.info["seconds"] else "detections only")
-    print(f"written to {out}")
-
-
-@contextmanager
-def _progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None] | None]:
-    """A bar on a terminal, a plain line a tenth elsewhere, nothing when quiet."""
-    if quiet:
-        yield None
-        return
-    if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:3.0f} %"),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task(text, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-        return
-    shown = -1
-
-    def plain(done: float, total: float) -> None:
-        nonlocal shown
-        tenth = int(10 * done / total) if total else 10
-        if tenth > shown:
-            shown = tenth
-            print(f"{text}: {10 * tenth} %", file=sys.stderr, flush=True)
-
-    yield plain
+        console.say("no ship found" if "track" in run.info["seconds"] else "detections only")
+    console.say(f"written to {out}")
 
 
 @app.command()
@@ -356,20 +343,19 @@ def calibrate(
 ) -> None:
     """Orientation, hydrophone polarity, position and amplitudes from AIS passages."""
     from obsnet.calibration import calibrate_waveforms
+    from obsnet.output import staged
 
     settings = _run_config(config, overrides, None, None)
     where = _station(station, code, start, depth_m=depth)
-    import obsnet.run as runs
-
-    folder = runs.prepare_folder(out)
-    with _progress("calibrating", quiet) as progress:
-        result = calibrate_waveforms(waveforms, where, _reference(ais, where), settings, start, end, progress)
-    result.write(folder / "calibration.yaml")
+    reference = _reference(ais, where)
+    with staged(out) as folder:
+        with console.progress("calibrating", quiet) as progress:
+            result = calibrate_waveforms(waveforms, where, reference, settings, start, end, progress)
+        result.write(folder / "calibration.yaml")
     if not quiet:
-        print(result.table())
-        print(
-            f"written to {folder / 'calibration.yaml'}; use it with: obsnet track … --calibration {folder / 'calibration.yaml'}"
-        )
+        console.say(result.table())
+        written = out / "calibration.yaml"
+        console.say(f"written to {written}; use it with: obsnet track … --calibration {written}")
 
 
 @app.command()
@@ -388,12 +374,12 @@ def simulate(
     """Simulate a record (miniSEED, StationXML, AIS, truth) with the twin."""
     from obsnet.twin.station import simulate_folder
 
-    with _progress("simulating", quiet) as progress:
+    with console.progress("simulating", quiet) as progress:
         summary = simulate_folder(
             out, hours=hours, seed=seed, ships=ships, ais=ais, station=station, start=start, progress=progress
         )
     if not quiet:
-        print(summary)
+        console.say(summary)
 
 
 @app.command()
@@ -418,10 +404,10 @@ def fetch(
         options["base_url"] = base_url
     if channels:
         options["channels"] = tuple(part.strip() for part in channels.split(","))
-    with _progress("fetching", quiet) as progress:
+    with console.progress("fetching", quiet) as progress:
         report = fetch_archive(target, start, end, out, progress=progress, **options)
     if not quiet:
-        print(report)
+        console.say(str(report))
 
 
 EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
@@ -440,23 +426,25 @@ def reproduce(
     """Repeat a paper's experiment; prints its numbers beside obsnet's."""
     import importlib
 
+    from obsnet.output import staged
+
     if name not in EXPERIMENTS:
         raise ConfigError(f"no experiment '{name}'; choose one of {', '.join(EXPERIMENTS)}")
     experiment = importlib.import_module(f"obsnet.experiments.{name}")
     options: dict[str, Any] = {"seed": seed, "jobs": jobs or os.cpu_count() or 1}
     if runs is not None:
         options["runs"] = runs
-    with _progress(name, quiet or as_json) as progress:
-        result = experiment.reproduce(progress=progress, **options)
-    if out is not None:
-        from obsnet.run import prepare_folder
-
-        result.plot(prepare_folder(out) / f"{name}.png")
+    with ExitStack() as whole:
+        folder = whole.enter_context(staged(out)) if out is not None else None
+        with console.progress(name, quiet or as_json) as progress:
+            result = experiment.reproduce(progress=progress, **options)
+        if folder is not None:
+            result.plot(folder / f"{name}.png")
     if as_json:
-        print(json.dumps(result.to_json()))
+        console.say(json.dumps(result.to_json()))
     elif not quiet:
         table = result.table()
-        print(table if isinstance(table, str) else "\n".join(map(str, table)))
+        console.say(table if isinstance(table, str) else "\n".join(map(str, table)))
 
 
 @app.command()
@@ -473,7 +461,7 @@ def plot(
     if figure is not None and figure not in FIGURES:
         raise ConfigError(f"no figure {figure}; choose one of {', '.join(map(str, FIGURES))}")
     for path in draw(folder, [figure] if figure else list(FIGURES), ais):
-        print(path)
+        console.say(str(path))
 
 
 @app.command()
@@ -481,4 +469,4 @@ def version() -> None:
     """Print the version."""
     import obsnet
 
-    print(obsnet.__version__)
+    console.say(obsnet.__version__)

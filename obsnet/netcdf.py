@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -52,9 +53,14 @@ class TimeWriter:
         """Finish the file and move it to its name."""
         if self._file is None:
             return
-        self._file.close()
-        self._file = None
-        os.replace(self._partial, self.path)
+        try:
+            self._file.close()
+            os.replace(self._partial, self.path)
+        except (OSError, RuntimeError) as error:  # HDF5 meets a full disk when it flushes
+            self._partial.unlink(missing_ok=True)
+            raise OutputError(f"cannot write {self.path}: {error}") from None
+        finally:
+            self._file = None
 
     def __enter__(self) -> TimeWriter:
         return self
@@ -66,7 +72,8 @@ class TimeWriter:
             self.close()
             return
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError, RuntimeError):
+                self._file.close()
         self._partial.unlink(missing_ok=True)
 
     def _create(self, block: xr.Dataset) -> Any:

@@ -7,7 +7,7 @@ were cut into blocks, and its memory does not grow with the record.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args, get_type_hints
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ from obsnet.detectors.analytic import (
 )
 from obsnet.detectors.background import BackgroundDirection
 from obsnet.detectors.maps import LikelihoodMaps, detections, presence
-from obsnet.errors import ConfigError
+from obsnet.errors import ConfigError, ModelError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table
@@ -56,6 +56,11 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.azimuth.step_s != self.range.step_s or self.azimuth.window_s != self.range.window_s:
             raise ConfigError("azimuth and range detectors must share window_s and step_s")
+        hints = get_type_hints(RunConfig)
+        for name in ("detector", "tracker"):
+            if getattr(self, name) not in get_args(hints[name]):
+                choices = ", ".join(get_args(hints[name]))
+                raise ConfigError(f"{name} must be one of {choices}, found {getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,8 @@ class Pipeline:
         table: xr.Dataset | None = None,
         threads: int | None = None,
     ) -> None:
+        if config.detector == "learned":
+            raise ModelError("no learned detector is shipped with this obsnet; use --detector analytic")
         self.station, self.config = station, config
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         amplitudes = amplitudes or Amplitudes.default().scaled_to(station.depth_m)

@@ -24,15 +24,16 @@ import obsnet
 from obsnet import netcdf
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps
-from obsnet.errors import ConfigError, LayoutError, OutputError
+from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation, travel_time
+from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
-from obsnet.signals.waveforms import open_waveforms
+from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.trackers.bearings_only import track_bearings
 from obsnet.trackers.bernoulli import track_azimuth
 from obsnet.trackers.grid_search import search
@@ -169,6 +170,7 @@ def _run(
         for minutes in _stream(source, config, pipeline, progress, clock):
             sink.append(minutes)
             clock.lap("write")
+        _require_minutes(sink.detections(), source, config)
         maps, features = sink.close()
     run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
     if tracking and len(run.presence):
@@ -177,6 +179,22 @@ def _run(
         clock.lap("track")
     run.info = _describe(run, source, clock)
     return run
+
+
+def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: RunConfig) -> None:
+    """Raise `WaveformError` where no minute has data: a record in which nothing was heard is no sea without ships."""
+    if (detections["coverage"] > 0).any():
+        return
+    begin, end = (iso(ns / 1e9) for ns in (source.begin_ns, source.end_ns))
+    why = [
+        f"{seed_id}: {channel.gap_s:g} s of gaps, {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
+        for seed_id, channel in source.report.channels.items()
+    ]
+    raise WaveformError(
+        f"no minute of {source.station.code} from {begin} to {end} has usable data ("
+        + "; ".join([*why, *source.report.notes])
+        + f"); give at least {2 * config.azimuth.window_s:g} s of working channels"
+    )
 
 
 def _stream(
@@ -199,7 +217,11 @@ def _stream(
 def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
     """Segments of a run's presence and the tracks within them, in time order."""
     delay = travel_time(run.table)
-    found = _followed(run) if run.config.tracker == "bernoulli" else segments(run.presence, run.config.segmentation)
+    found = (
+        _followed(run)
+        if run.config.tracker == "bernoulli"
+        else segments(run.presence, run.config.segmentation)
+    )
     tracks: list[Track] = []
     for segment in found:
         near = [known for known in tracks if known.end > segment.start - 3600.0]
@@ -215,7 +237,9 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
 def _followed(run: Run) -> list[Segment]:
     """Segments in which the Bernoulli filter, minute by minute, holds a ship for sure (existence over 0.9)."""
     if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
-        raise ConfigError("the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid")
+        raise ConfigError(
+            "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
+        )
     times = to_posix(run.maps["time"].values)
     held = track_azimuth(times, run.maps["azimuth_llr"].values, run.maps["azimuth"].values)
     run.live = pd.DataFrame(
@@ -227,7 +251,9 @@ def _followed(run: Run) -> list[Segment]:
         }
     )
     sure = np.flatnonzero(np.diff(np.concatenate([[False], held.existence > 0.9, [False]]).astype(np.int8)))
-    stretches = [Segment(float(times[lo]), float(times[hi - 1])) for lo, hi in zip(sure[::2], sure[1::2], strict=True)]
+    stretches = [
+        Segment(float(times[lo]), float(times[hi - 1])) for lo, hi in zip(sure[::2], sure[1::2], strict=True)
+    ]
     return [s for s in stretches if s.end - s.start >= 60.0 * run.config.segmentation.shortest_min]
 
 
@@ -334,32 +360,6 @@ TRACK_COLUMNS = [
     "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
     "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
 ]  # fmt: skip
-
-
-def prepare_folder(folder: str | Path) -> Path:
-    """Make an output folder; `OutputError` if it is a file or cannot be written."""
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"output {folder} is a file; give a folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe.{os.getpid()}"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise OutputError(f"cannot write into {folder}: {error.strerror}") from None
-    return folder
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a small file aside and move it into place."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def write_tables(run: Run, folder: Path) -> None:

@@ -1,0 +1,82 @@
+"""Output files that appear whole or not at all, and a folder's files together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from obsnet.errors import OutputError
+
+
+def prepare_folder(folder: str | Path) -> Path:
+    """Make an output folder; `OutputError` if it is a file or cannot be written."""
+    if not str(folder).strip():
+        raise OutputError("the output folder is empty text; name a folder")
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"output {folder} is a file; give a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(f"cannot write into {folder}: {error.strerror}; give another folder") from None
+    return folder
+
+
+@contextmanager
+def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path]:
+    """A folder to write into, whose files take their places in `folder` together when all are written.
+
+    After an error or an interruption `folder` is as it was before, and away if it was not there.
+
+    Parameters
+    ----------
+    folder : where the files shall be.
+    leftovers : names of files that an earlier run may have left in `folder` and that must not stay beside the
+        new ones.
+
+    Raises
+    ------
+    OutputError
+        `folder` is a file, or cannot be written.
+    """
+    made = [path for path in (Path(folder), *Path(folder).parents) if not path.exists()]
+    try:
+        target = prepare_folder(folder)
+        stage = Path(tempfile.mkdtemp(prefix=".unfinished-", suffix=".tmp", dir=target))
+        try:
+            yield stage
+            _move(stage, target, leftovers)
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+    finally:
+        for path in made:
+            with suppress(OSError):  # what holds files stays
+                path.rmdir()
+
+
+def _move(stage: Path, folder: Path, leftovers: tuple[str, ...]) -> None:
+    written = sorted(path.name for path in stage.iterdir())
+    try:
+        for name in written:
+            os.replace(stage / name, folder / name)
+        for name in set(leftovers) - set(written):
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder / name}: {error.strerror}") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a small file aside and move it into place."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"cannot write {path}: {error.strerror}") from None
