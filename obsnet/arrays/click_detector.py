@@ -99,9 +99,7 @@ class DetectorConfig:
 
 @dataclass(frozen=True)
 class Arrival:
-    """One detection on one hydrophone: time from the record's start [s], octaves that exceeded, SNR [dB] in
-    them.
-    """
+    """Detection on one hydrophone: time from the record's start [s], octaves that exceeded, SNR [dB] there."""
 
     time: float
     hydrophone: int
@@ -110,8 +108,7 @@ class Arrival:
 
 
 def octave_energies(recording: Recording, config: DetectorConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Energy of sliding Hann windows in octaves (paper's eq. 1 in each band), and the degrees of freedom of
-    noise.
+    """Energy of sliding Hann windows by octave (paper's eq. 1 in each), and noise's degrees of freedom.
 
     Returns
     -------
@@ -200,8 +197,7 @@ def arrivals(recording: Recording, config: DetectorConfig) -> list[Arrival]:
 
 
 def coincidences(found: Sequence[Arrival], within_s: float, least: int) -> list[list[Arrival]]:
-    """Group arrivals into clicks: the first one unused, and the next on every other hydrophone within
-    `within_s`.
+    """Group arrivals into clicks: the first one unused, and the next one on every other hydrophone.
 
     Parameters
     ----------

@@ -142,8 +142,7 @@ def simulated_recording(
     source_level: float,
     reflection: float = 0.8,
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
-    """Samples of every hydrophone: clicks, their surface echoes and coloured sea noise of standard deviation
-    1.
+    """Samples of every hydrophone: clicks, their surface echoes, coloured noise of standard deviation 1.
 
     Parameters
     ----------

@@ -18,9 +18,7 @@ from obsnet.trackers.track_tree import AnimalTrack
 
 
 def association_counts(found: Association, scene: TdoaScene, number: int | None) -> dict[str, float]:
-    """TDOAs of clutter and those that a track took, the first animal's and those that track `number` did not
-    take.
-    """
+    """Clutter and what tracks took of it; the first animal's TDOAs and those that track `number` missed."""
     animal, owner = np.concatenate(scene.animal), np.concatenate(found.owner)
     return {
         "clutter": float((animal < 0).sum()),

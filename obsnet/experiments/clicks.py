@@ -93,9 +93,7 @@ def reproduce(
 
 
 def clutter(rng: np.random.Generator) -> dict[str, float]:
-    """One run of the first scenario: sums of squared errors, counts, and errors over what the filter
-    states.
-    """
+    """One run of the first scenario: sums of squared errors, and counts."""
     scene, array, pairs = clutter_scene(rng)
     found, _ = tracked(scene, array, pairs, clicking=0.95, seed=rng)
     azimuth, elevation = scene.paths[0].direction(scene.time, array.mean_depth_m)
@@ -201,9 +199,7 @@ def tracked(
 def simulated_record(
     rng: np.random.Generator, array: CompactArray
 ) -> tuple[list[AnimalPath], ClickRecord, list[np.ndarray], list[np.ndarray]]:
-    """A simulated recording of two animals, written as WAV and processed; arrival times of clicks and
-    echoes.
-    """
+    """A simulated recording of two animals, through a WAV file; arrival times of clicks and of echoes."""
     paths = [simulated_path(rng, RECORDING_S) for _ in range(2)]
     emitted = [simulated_click_times(rng, -2.0, RECORDING_S, interval) for interval in (1.0, 0.8)]
     samples, direct, echo = simulated_recording(rng, array, paths, emitted, RECORDING_S, source_level=4.0)

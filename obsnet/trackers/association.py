@@ -85,9 +85,7 @@ class Association:
 
 @dataclass
 class _Particles:
-    """Histories: log weight, log joint probability, live tracks (−1 for none), and chained tracks that have
-    ended.
-    """
+    """Histories: log weight, log joint probability, live tracks (−1: none), chained tracks that ended."""
 
     log_weight: np.ndarray
     joint: np.ndarray
@@ -213,9 +211,7 @@ def _grow(
     chosen: np.ndarray,
     birth: np.ndarray,
 ) -> dict[tuple[int, int], int]:
-    """New nodes, one for each choice that some particle made: by (track, choice), new animals by (−1,
-    choice).
-    """
+    """New nodes, one for each choice that some particle made: by (track, choice), −1 for new animals."""
     children: dict[tuple[int, int], int] = {}
     lasting = forecast.existence * np.exp(scan.log_miss - options.miss)
     for track, choice in {*zip(live[live >= 0].tolist(), chosen[live >= 0].tolist(), strict=True)}:

@@ -124,9 +124,7 @@ def _variances(jacobian: np.ndarray, forecast: Forecast, noise: np.ndarray) -> n
 def _gated(
     scan: Scan, model: ObservationModel, forecast: Forecast, noise: np.ndarray, gate_std: float, branches: int
 ) -> list[tuple[int, ...]]:
-    """For each track the best combinations of measurements in its gate, by their factors channel by
-    channel.
-    """
+    """For each track the best combinations of measurements in its gate, judged channel by channel."""
     if not (len(forecast.mean) and len(scan.value)):
         return []
     predicted, jacobian = model.observe(forecast.mean)
