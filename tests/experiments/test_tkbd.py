@@ -117,6 +117,13 @@ def test_a_track_that_is_lost_is_held_for_its_share():
     assert found.held == pytest.approx(199.0 / 399.0, abs=0.01)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_training():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tkbd, "TRAINING_S", 60.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def small():
     return tkbd.reproduce(runs=2, seed=3, approach=NEAR, contenders=PAIR)
@@ -153,7 +160,7 @@ def test_a_tracker_that_never_confirms_is_null(small):
 
 
 def test_track_before_detect_hears_the_target_at_least_4_db_below_cfar():
-    far = Approach(start_range_m=1200.0, start_azimuth_deg=-45.0, end_azimuth_deg=10.0, target_free_s=20.0)
+    far = Approach(start_range_m=900.0, start_azimuth_deg=-45.0, end_azimuth_deg=10.0, target_free_s=20.0)
     result = tkbd.reproduce(runs=2, seed=4, approach=far, contenders=PAIR)
     assert result.gain_db >= 4.0
     assert result.held("TVAR14") > 0.95
