@@ -83,8 +83,9 @@ class ClutterFilter:
     """Removes from each cepstrum what was the same over the window before it.
 
     Every `clutter_step_s` (on UTC multiples) the filter learns a basis from the valid frames of the `clutter_window_s`
-    before; the frames until the next such instant are projected off it. A station that has heard fewer than
-    `WARM_UP_FRAMES` frames in that window does not know its clutter: its frames are NaN, which costs coverage.
+    before; the frames until the next such instant are projected off it. Until a station has heard `WARM_UP_FRAMES` frames
+    in that window, the mean of those that it has heard is subtracted instead, and the difference scaled to the spread of
+    a single frame's noise; only its first frame is NaN.
 
     Parameters
     ----------
@@ -104,6 +105,7 @@ class ClutterFilter:
         self._steps: dict[int, _Step] = {}
         self._learned: np.ndarray | None = None
         self._learned_step: int | None = None
+        self._early = _Step(0, np.zeros(()))
 
     def __call__(self, cepstra: xr.DataArray) -> xr.DataArray:
         """Filter the next block of frames, dims (quefrency, time); blocks must come in time order."""
@@ -143,7 +145,7 @@ class ClutterFilter:
         count = sum(held.count for held in self._steps.values())
         self._learned_step = step
         if count < self.WARM_UP_FRAMES:
-            self._learned = None
+            self._learned, self._early = None, _Step(0, np.zeros(()))
         elif self.config.clutter == "svd":
             self._learned = leading_basis(self._moment(), count)
         else:
@@ -155,13 +157,27 @@ class ClutterFilter:
     def _project(self, frames: np.ndarray) -> np.ndarray:
         learned = self._learned
         if learned is None:
-            return np.full_like(frames, np.nan)
+            return self._off_early_mean(frames)
         if self.config.clutter == "svd":
             return frames - (frames @ learned) @ learned.T
         return frames - learned.astype(frames.dtype)
 
+    def _off_early_mean(self, frames: np.ndarray) -> np.ndarray:
+        valid = ~np.isnan(frames[:, 0])
+        heard = np.where(valid[:, None], frames, 0.0).astype(float)
+        before = np.broadcast_to(self._early.moment, (1, frames.shape[1]))
+        total = np.cumsum(np.concatenate([before, heard]), axis=0)
+        count = self._early.count + np.concatenate([[0], np.cumsum(valid)])
+        self._early = _Step(int(count[-1]), total[-1])
+        number = count[:-1, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off = (frames - total[:-1] / number) * np.sqrt(number / (number + 1.0))
+        return off.astype(frames.dtype)
+
     def _remember(self, step: int, frames: np.ndarray) -> None:
         valid = frames[~np.isnan(frames[:, 0])].astype(float)
+        if not len(valid):  # a dead hydrophone shall not fill the memory with Gram matrices of nothing
+            return
         moment = valid.T @ valid if self.config.clutter == "svd" else valid.sum(axis=0)
         held = self._steps.get(step)
         self._steps[step] = _Step(len(valid), moment) if held is None else held + _Step(len(valid), moment)

@@ -101,10 +101,26 @@ def test_output_forgets_what_lies_before_the_window():
     np.testing.assert_allclose(late[:, 250:], whole[:, 450:], atol=2e-6)
 
 
-def test_unknown_clutter_costs_coverage():
-    filtered = ClutterFilter()(cepstrogram(noise_spectra(np.random.default_rng(7), 100))).values
-    assert np.isnan(filtered[:, : ClutterFilter.WARM_UP_FRAMES]).all()
-    assert not np.isnan(filtered[:, ClutterFilter.WARM_UP_FRAMES :]).any()
+@pytest.mark.parametrize("clutter", ["svd", "mean"])
+def test_before_the_clutter_is_known_its_mean_goes(clutter):
+    cepstra = cepstrogram(noise_spectra(np.random.default_rng(7), 600))
+    quefrency = cepstra["quefrency"].values
+    cepstra.values[100] += 0.3
+    early = slice(1, ClutterFilter.WARM_UP_FRAMES)
+    filtered = ClutterFilter(CepstrogramConfig(clutter=clutter))(cepstra).values
+    assert np.isnan(filtered[:, 0]).all()
+    assert not np.isnan(filtered[:, 1:]).any()
+    assert abs(filtered[100, early].mean()) < 0.03
+    spread = filtered[200:480, early].std() / noise_std(quefrency, N)[200:480].mean()
+    assert spread == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_dead_hydrophone_leaves_nothing_in_memory():
+    cepstra = cepstrogram(noise_spectra(np.random.default_rng(9), 600))
+    cepstra.values[:] = np.nan
+    filtering = ClutterFilter()
+    assert np.isnan(filtering(cepstra).values).all()
+    assert not filtering._steps
 
 
 def test_basis_is_the_leading_singular_vectors():
