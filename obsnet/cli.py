@@ -32,6 +32,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _folder(text: str | Path) -> Path:
+    if not str(text).strip():
+        raise typer.BadParameter("it is empty text; name a folder")
+    return Path(text)
+
+
 Waveforms = Annotated[
     list[str], typer.Argument(help="Waveform files, folders or an SDS archive, any format obspy reads.")
 ]
@@ -39,7 +46,7 @@ StationFile = Annotated[Path, typer.Option("--station", help="StationXML of the 
 Code = Annotated[
     str | None, typer.Option("--code", help="NET.STA, where the StationXML holds several stations.")
 ]
-Out = Annotated[Path, typer.Option("--out", help="Output folder.")]
+Out = Annotated[Path, typer.Option("--out", help="Output folder.", parser=_folder)]
 DetectorName = Annotated[str | None, typer.Option("--detector", help="learned or analytic.")]
 TrackerName = Annotated[str | None, typer.Option("--tracker", help="grid, bernoulli or focalization.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of parameters.")]
