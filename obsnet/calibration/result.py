@@ -99,7 +99,8 @@ class Calibration:
 
     def table(self) -> str:
         """Plain text for people."""
-        lines = [f"{self.station}: calibrated with {self.passages} AIS passages"]
+        plural = "" if self.passages == 1 else "s"
+        lines = [f"{self.station}: calibrated with {self.passages} AIS passage{plural}"]
         if self.orientation:
             found = self.orientation
             lines.append(f"  first horizontal  {found.azimuth_deg:.1f}° ± {found.std_deg:.1f}°")

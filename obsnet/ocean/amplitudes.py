@@ -82,7 +82,10 @@ class Amplitudes:
         range, and without them their branches are read as nearer ones. Places carry on the table's spacing, strengths its
         decrease: guesses, for a calibration to replace.
         """
-        further = {"7-9": SkewNormal(0.9e3, 4.0, 40.0e3, 20.0e3), "9-11": SkewNormal(0.8e3, 4.0, 53.0e3, 20.0e3)}
+        further = {
+            "7-9": SkewNormal(0.9e3, 4.0, 40.0e3, 20.0e3),
+            "9-11": SkewNormal(0.8e3, 4.0, 53.0e3, 20.0e3),
+        }
         return cls({**cls.table_ii().curves, **further})
 
     @property
@@ -115,11 +118,9 @@ class Amplitudes:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain mapping, ready for YAML or JSON."""
-        curves = {
-            pair: {"k": c.k, "alpha": c.alpha, "xi_m": c.xi_m, "omega_m": c.omega_m}
-            for pair, c in self.curves.items()
-        }
-        return {"depth_m": self.depth_m, "pairs": curves}
+        names = ("k", "alpha", "xi_m", "omega_m")
+        curves = {pair: {name: float(getattr(c, name)) for name in names} for pair, c in self.curves.items()}
+        return {"depth_m": float(self.depth_m), "pairs": curves}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Amplitudes:

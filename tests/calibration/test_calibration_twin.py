@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from obsnet.ais import reference_tracks
-from obsnet.calibration import calibrate, calibrate_waveforms
+from obsnet.calibration import Calibration, calibrate, calibrate_waveforms
 from obsnet.calibration.result import moved
 from obsnet.kinematics import StraightCourse
 from obsnet.ocean.rays import propagation_table, travel_time
@@ -45,7 +45,7 @@ def passage(seed, cpa_m, polarity, directed=0.3):
 
 
 @pytest.mark.parametrize(("seed", "cpa_m", "polarity"), [(3, 5000.0, -1), (6, -14e3, 1)])
-def test_orientation_polarity_and_place_are_recovered(seed, cpa_m, polarity):
+def test_orientation_polarity_and_place_are_recovered(seed, cpa_m, polarity, tmp_path):
     simulation, station = passage(seed, cpa_m, polarity)
     recorder = simulation.scenario.recorder
     tracks = reference_tracks(simulation.ais, station)
@@ -63,6 +63,8 @@ def test_orientation_polarity_and_place_are_recovered(seed, cpa_m, polarity):
     )
     assert "3-5" in found.fitted_pairs
     assert done[-1][0] <= done[-1][1] == pytest.approx(5 * 3600.0, rel=0.01)
+    found.write(tmp_path / "calibration.yaml")
+    assert Calibration.read(tmp_path / "calibration.yaml") == found
     heard_right = share_on_the_ship(simulation, found.apply(station))
     assert heard_right > 0.5 > share_on_the_ship(simulation, station)
 
