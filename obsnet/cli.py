@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     command = typer.main.get_command(app)
-    with warnings.catch_warnings(), console.terminable():
+    with warnings.catch_warnings(), console.stoppable():
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
         try:
@@ -253,6 +253,7 @@ def _track(
             )  # fmt: skip
         runs.write_tables(run, folder)
         run.plot(folder / "report.png", reference=reference)
+        console.heed()
     if not quiet:
         _summary(run, out)
 

@@ -1,4 +1,4 @@
-"""What a command says and hears: lines on standard output, a progress bar, a request to terminate.
+"""What a command says and hears: lines on standard output, a progress bar, a wish that it stop.
 
 Standard error is for errors alone.
 """
@@ -11,21 +11,43 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import NoReturn
 
 from obsnet.errors import OutputError
 
+_wishes: list[int] = []
+"""Signals to stop that this process has been sent; like its handlers, they belong to the process."""
+
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Let a request to terminate unwind the run, so that it leaves nothing behind."""
+def stoppable() -> Iterator[None]:
+    """Let an interruption (SIGINT) and a request to terminate (SIGTERM) unwind a run, so that it leaves nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    _wishes.clear()
+    silent = sys.unraisablehook
+    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    sys.unraisablehook = lambda lost: None if _wishes else silent(lost)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = silent
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def heed() -> None:
+    """Stop if that was wished: Python loses an exception that a signal raises inside a finaliser."""
+    if _wishes:
+        _stop(_wishes[-1])
+
+
+def _stop(number: int, frame: object = None) -> NoReturn:
+    _wishes.append(number)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    sys.exit(128 + number)
 
 
 def say(text: str) -> None:
@@ -60,12 +82,11 @@ def hush() -> None:
 
 
 @contextmanager
-def progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None] | None]:
-    """A bar on a terminal, a plain line a tenth elsewhere, nothing when quiet."""
+def progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None]]:
+    """A bar on a terminal, a plain line a tenth elsewhere, nothing when quiet; each call heeds a wish to stop."""
     if quiet:
-        yield None
-        return
-    if sys.stderr.isatty():
+        yield lambda done, total: heed()
+    elif sys.stderr is not None and sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -77,15 +98,25 @@ def progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None] 
         )
         with Progress(*columns, console=Console(stderr=True)) as bar:
             task = bar.add_task(text, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-        return
-    shown = -1
 
-    def plain(done: float, total: float) -> None:
-        nonlocal shown
+            def draw(done: float, total: float) -> None:
+                heed()
+                bar.update(task, completed=done, total=total)
+
+            yield draw
+    else:
+        yield _Tenths(text)
+
+
+class _Tenths:
+    """A line whenever another tenth is done."""
+
+    def __init__(self, text: str) -> None:
+        self._text, self._shown = text, -1
+
+    def __call__(self, done: float, total: float) -> None:
+        heed()
         tenth = int(10 * done / total) if total else 10
-        if tenth > shown:
-            shown = tenth
-            say(f"{text}: {10 * tenth} %")
-
-    yield plain
+        if tenth > self._shown:
+            self._shown = tenth
+            say(f"{self._text}: {10 * tenth} %")
