@@ -129,6 +129,7 @@ def filter_config(setting: Setting, particles: int, seed: int) -> FocalizationCo
         tdoa_std_s=(TDOA_STD_S,),
         false_alarms=setting.false_alarms,
         false_alarm_memory_s=np.inf,
+        false_alarm_resolution_s=0.0,
         min_tdoa_s=0.0,
         max_tdoa_s=MAX_TDOA_S,
         max_range_m=MAX_RANGE_M,

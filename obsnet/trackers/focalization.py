@@ -14,11 +14,13 @@ import numpy as np
 from scipy.special import expit
 
 from obsnet.errors import ConfigError, FilterError, LayoutError
+from obsnet.trackers.false_alarms import FalseAlarms
 from obsnet.trackers.particles import effective_sample_size, normalise, systematic_resampling, weighted_mean
 from obsnet.trackers.tdoa_association import TdoaModel, association_log_likelihood
 
 RANGE, DEPTH, RATE = 0, 1, 2
-LOWEST_FALSE_ALARMS = 0.1
+EXPLAINING = 200
+"""Particles that decide which measurements the source explains."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,10 @@ class FocalizationConfig:
     detection_probability : per pair, where both its paths exist; one value serves every pair.
     tdoa_std_s : standard deviation of a measured delay, s, per pair or one for all.
     false_alarms : mean number per scan, uniform between `min_tdoa_s` and `max_tdoa_s`, outside of which no
-        delay is looked at. Where `false_alarm_memory_s` is finite it is the start of a running mean of what
-        the source does not explain.
+        delay is looked at.
+    false_alarm_memory_s, false_alarm_resolution_s : where finite, time constant of a running mean, begun with
+        `false_alarms`, of the delays that the source does not explain; and how finely it knows where they
+        are, 0 for uniform ones.
     max_range_m, range_prior : the area of interest; `uniform` in range as in the paper, or `area`,
         proportional to range.
     max_source_depth_m : the source's depth is uniform down to here, 0 for a ship.
@@ -48,24 +52,25 @@ class FocalizationConfig:
     birth_share : births per scan as a share of J, with as much weight as birth and jump give them.
     """
 
-    detection_probability: tuple[float, ...] = (0.5, 0.5, 0.3)
+    detection_probability: tuple[float, ...] = (0.2,)
     tdoa_std_s: tuple[float, ...] = (0.02,)
     false_alarms: float = 2.0
-    false_alarm_memory_s: float = 1800.0
+    false_alarm_memory_s: float = 1200.0
+    false_alarm_resolution_s: float = 0.05
     min_tdoa_s: float = 0.3
     max_tdoa_s: float = 6.5
-    max_range_m: float = 50_000.0
+    max_range_m: float = 80_000.0
     range_prior: Literal["uniform", "area"] = "area"
     max_source_depth_m: float = 0.0
     rate_prior: Literal["normal", "uniform"] = "uniform"
     rate_scale_mps: float = 13.0
-    acceleration_std_mps2: float = 0.02
+    acceleration_std_mps2: float = 0.015
     depth_rate_std_mps: float = 0.0
     range_diffusion_m: float = 2.0
     particles: int = 10_000
     survival_s: float = 14_400.0
     birth_s: float = 14_400.0
-    jump_s: float = 10_000.0
+    jump_s: float = 30_000.0
     birth_share: float = 0.2
     seed: int = 0
 
@@ -158,18 +163,26 @@ class FocalizationFilter:
         self.model, self.config = model, config
         self._detection = _per_pair(config.detection_probability, model.pairs, "detection_probability")
         self._std = _per_pair(config.tdoa_std_s, model.pairs, "tdoa_std_s")
-        rng = np.random.default_rng([config.seed, 0])
-        self._particles = self._prior(rng, config.particles)
+        self._rng = np.random.default_rng([config.seed, 0])
+        self._particles = self._prior(config.particles)
         self._log_weights = np.full(config.particles, -np.log(config.particles))
         self._steps = 0
         self._log_odds = 0.0
-        self.false_alarms = float(config.false_alarms)
+        window = (config.min_tdoa_s, config.max_tdoa_s)
+        self._clutter = FalseAlarms(
+            config.false_alarms, window, config.false_alarm_memory_s, config.false_alarm_resolution_s
+        )
         self.existence = 1.0 if not np.isfinite(config.birth_s) else _stationary_existence(config)
 
     @property
     def particles(self) -> np.ndarray:
         """Range [m], depth [m] and range rate [m/s], dims (particle, state)."""
         return self._particles
+
+    @property
+    def false_alarms(self) -> float:
+        """Mean number of false alarms per scan, as learned so far."""
+        return self._clutter.count
 
     @property
     def log_weights(self) -> np.ndarray:
@@ -196,14 +209,14 @@ class FocalizationFilter:
         if not (np.isfinite(elapsed_s) and elapsed_s >= 0):
             raise LayoutError(f"scans must come in time order, found {elapsed_s} s since the scan before")
         self._steps += 1
-        rng = np.random.default_rng([self.config.seed, self._steps])
-        self._predict(rng, float(elapsed_s))
+        self._rng = np.random.default_rng([self.config.seed, self._steps])
+        self._predict(float(elapsed_s))
         self._log_odds = _logit(self.existence)
         log_evidence, expected = 0.0, 0.0
         if measured_s is not None:
             log_evidence, expected = self._update(self._observable(measured_s), elapsed_s, receiver_depth_m)
         scan = self._estimate(log_evidence, expected)
-        self._resample(rng)
+        self._resample()
         return scan
 
     def log_likelihood(
@@ -220,7 +233,7 @@ class FocalizationFilter:
             "particles": self._particles.copy(),
             "log_weights": self._log_weights.copy(),
             "existence": np.array(self.existence),
-            "false_alarms": np.array(self.false_alarms),
+            "false_alarms": self._clutter.local.copy(),
             "steps": np.array(self._steps),
         }
 
@@ -233,11 +246,14 @@ class FocalizationFilter:
                 f"the configuration asks for {self.config.particles}"
             )
         self._particles, self._log_weights = particles, log_weights
-        self.existence, self.false_alarms = float(state["existence"]), float(state["false_alarms"])
+        self.existence, self._clutter.local = (
+            float(state["existence"]),
+            np.array(state["false_alarms"], float),
+        )
         self._steps = int(state["steps"])
 
-    def _prior(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        config = self.config
+    def _prior(self, count: int) -> np.ndarray:
+        config, rng = self.config, self._rng
         states = np.empty((count, 3))
         stratum = (np.arange(count) + rng.random(count)) / count
         if config.range_prior == "area":
@@ -250,8 +266,8 @@ class FocalizationFilter:
             states[:, RATE] = config.rate_scale_mps * rng.uniform(-1.0, 1.0, count)
         return states
 
-    def _predict(self, rng: np.random.Generator, elapsed_s: float) -> None:
-        config, states = self.config, self._particles
+    def _predict(self, elapsed_s: float) -> None:
+        config, states, rng = self.config, self._particles, self._rng
         acceleration = config.acceleration_std_mps2 * rng.standard_normal(len(states))
         states[:, RANGE] += states[:, RATE] * elapsed_s + 0.5 * elapsed_s**2 * acceleration
         states[:, RATE] += elapsed_s * acceleration
@@ -268,9 +284,9 @@ class FocalizationFilter:
             states[:, RATE] = _fold(states[:, RATE] + config.rate_scale_mps, 2 * config.rate_scale_mps)
             states[:, RATE] -= config.rate_scale_mps
         self._log_weights[states[:, RANGE] > config.max_range_m] = -np.inf
-        self._predict_existence(rng, elapsed_s)
+        self._predict_existence(elapsed_s)
 
-    def _predict_existence(self, rng: np.random.Generator, elapsed_s: float) -> None:
+    def _predict_existence(self, elapsed_s: float) -> None:
         config = self.config
         inside = float(np.exp(self._log_weights).sum())
         stays = self.existence * inside * float(np.exp(-elapsed_s / config.survival_s))
@@ -285,7 +301,7 @@ class FocalizationFilter:
             return
         comes = (1.0 - self.existence) * -np.expm1(-elapsed_s / config.birth_s)
         jumps = stays * -np.expm1(-elapsed_s / config.jump_s)
-        births = self._prior(rng, round(config.birth_share * config.particles))
+        births = self._prior(round(config.birth_share * config.particles))
         with np.errstate(divide="ignore"):
             old = self._log_weights + np.log((stays - jumps) / inside if inside > 0 else 0.0)
             new = np.full(len(births), np.log((comes + jumps) / len(births)))
@@ -308,7 +324,7 @@ class FocalizationFilter:
         detection = self._detection * self.model.visibility(states[:, RANGE])
         window = (self.config.min_tdoa_s, self.config.max_tdoa_s)
         return association_log_likelihood(
-            predicted, measured, detection, self._std, self.false_alarms, window
+            predicted, measured, detection, self._std, self._clutter.density(measured), window
         )
 
     def _update(
@@ -318,11 +334,21 @@ class FocalizationFilter:
         self._log_weights, log_evidence = normalise(self._log_weights + log_ratio)
         self._log_odds = _logit(self.existence) + log_evidence
         self.existence = float(expit(self._log_odds))
-        expected = self.existence * float(np.exp(self._log_weights) @ explained)
-        forgetting = -np.expm1(-elapsed_s / self.config.false_alarm_memory_s)
-        self.false_alarms += forgetting * (max(len(measured) - expected, 0.0) - self.false_alarms)
-        self.false_alarms = max(self.false_alarms, min(LOWEST_FALSE_ALARMS, self.config.false_alarms))
-        return log_evidence, expected
+        if np.isfinite(self.config.false_alarm_memory_s):
+            unexplained = self._unexplained(measured, receiver_depth_m)
+            self._clutter.learn(measured, unexplained, elapsed_s)
+        return log_evidence, self.existence * float(np.exp(self._log_weights) @ explained)
+
+    def _unexplained(self, measured: np.ndarray, receiver_depth_m: float | None) -> np.ndarray:
+        """Probability that the source did not make each measurement: what the likelihood would be without
+        it."""
+        some = self._particles[systematic_resampling(self._log_weights, self._rng, EXPLAINING)]
+        whole, _ = self._likelihood(some, measured, receiver_depth_m)
+        without = [
+            self._likelihood(some, np.delete(measured, m), receiver_depth_m)[0] for m in range(len(measured))
+        ]
+        odd = np.array([np.exp(part - whole).mean() for part in without])
+        return 1.0 - self.existence * (1.0 - np.minimum(odd, 1.0))
 
     def _estimate(self, log_evidence: float, expected: float) -> Scan:
         mean, covariance = weighted_mean(self._particles, self._log_weights)
@@ -338,11 +364,11 @@ class FocalizationFilter:
             expected_detections=expected,
         )
 
-    def _resample(self, rng: np.random.Generator) -> None:
+    def _resample(self) -> None:
         count = self.config.particles
         if len(self._particles) == count and effective_sample_size(self._log_weights) >= 0.5 * count:
             return
-        kept = systematic_resampling(self._log_weights, rng, count)
+        kept = systematic_resampling(self._log_weights, self._rng, count)
         self._particles = self._particles[kept]
         self._log_weights = np.full(count, -np.log(count))
 

@@ -7,6 +7,7 @@ there are pairs. The filter carries all of them and lets the ship's motion and f
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,14 +31,15 @@ class StationFocalizationConfig:
 
     Parameters
     ----------
-    pairs : path pairs whose delays are looked for.
+    pairs : path pairs whose delays are looked for; where there is none, every two successive paths of the
+    table.
     half_amplitude : cepstral amplitude at which a pair is seen half as often as at best (see `TableModel`).
     range_step_m : spacing of the maps' ranges, m.
     map_smoothing_m : standard deviation of the kernel that makes a density of the particles, m.
     detection, filter : of the delays, and of the particle filter.
     """
 
-    pairs: tuple[str, ...] = ("1-3", "3-5", "5-7")
+    pairs: tuple[str, ...] | None = None
     half_amplitude: float = 0.02
     range_step_m: float = 70.0
     map_smoothing_m: float = 100.0
@@ -135,7 +137,8 @@ class StationFocalization:
         amplitudes: Amplitudes | None = None,
     ) -> None:
         self.config = config
-        self.model = TableModel(table, config.pairs, amplitudes, config.half_amplitude)
+        pairs = config.pairs or tuple(f"{a}-{b}" for a, b in pairwise(table["path"].values.tolist()))
+        self.model = TableModel(table, pairs, amplitudes, config.half_amplitude)
         self.filter = FocalizationFilter(self.model, config.filter)
         self._time = -np.inf
         self._quefrency = np.empty(0)

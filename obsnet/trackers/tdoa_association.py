@@ -185,15 +185,15 @@ def association_log_likelihood(
     measured_s: np.ndarray,
     detection_probability: np.ndarray,
     std_s: np.ndarray,
-    false_alarms: float,
+    false_alarm_density: np.ndarray | float,
     window_s: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood ratio of unlabelled delays for each hypothetical source, against false alarms alone.
 
-    With d_l the probability that pair l gives a measurement and λ = μ_FA / (b − a) the density of false
-    alarms in the window [a, b) of observable delays,
+    With d_l the probability that pair l gives a measurement, λ the density of false alarms and [a, b) the
+    window of observable delays,
 
-        ln Σ_a Π_l r_l(a_l),   r_l(0) = 1 − d_l P_l,   r_l(m) = d_l N(z_m; g_l, σ_l²) / λ,
+        ln Σ_a Π_l r_l(a_l),   r_l(0) = 1 − d_l P_l,   r_l(m) = d_l N(z_m; g_l, σ_l²) / λ(z_m),
 
     over all vectors a in which no measurement serves two pairs. d_l is zero where the prediction is NaN. P_l
     is the probability that the noisy delay falls into the window, without which a branch that leaves the
@@ -205,7 +205,8 @@ def association_log_likelihood(
     measured_s : array, dims (measurement,), s, all within `window_s`.
     detection_probability : array, dims (pair,) or (source, pair), 0 to 1.
     std_s : array, dims (pair,), s.
-    false_alarms : mean number of false alarms in the window (Poisson), positive.
+    false_alarm_density : λ, false alarms (Poisson) per second of delay, positive; dims (measurement,) or one
+        for all, μ_FA / (b − a) for the paper's uniform ones.
     window_s : s, the window [a, b).
 
     Returns
@@ -227,8 +228,8 @@ def association_log_likelihood(
     )
     std = np.ascontiguousarray(np.broadcast_to(std_s, predicted.shape[1:]), dtype=np.float64)
     low, high = window_s
-    density = false_alarms / (high - low)
     measured = np.ascontiguousarray(measured_s, dtype=np.float64)
+    density = np.ascontiguousarray(np.broadcast_to(false_alarm_density, measured.shape), dtype=np.float64)
     return _sum_associations(predicted, measured, detection, std, density, low, high)
 
 
@@ -243,7 +244,7 @@ def _sum_associations(predicted, measured, detection, std, density, low, high):
     ratio = np.empty(n_pair)
     close = np.empty(n_pair, np.int64)
     precision = 1.0 / std
-    peak = precision / (np.sqrt(2.0 * np.pi) * density)
+    peak = precision / np.sqrt(2.0 * np.pi)
     for j in range(n_source):
         reach, total, weighted = NEGLIGIBLE_SIGMAS, 1.0, 0.0
         for pair in range(n_pair):
@@ -259,7 +260,8 @@ def _sum_associations(predicted, measured, detection, std, density, low, high):
             for pair in range(n_pair):
                 distance = (measured[m] - predicted[j, pair]) * precision[pair]
                 if abs(distance) < reach:
-                    ratio[n_close] = detection[j, pair] * peak[pair] * np.exp(-0.5 * distance * distance)
+                    rate = detection[j, pair] * peak[pair] / density[m]
+                    ratio[n_close] = rate * np.exp(-0.5 * distance * distance)
                     close[n_close] = 1 << pair
                     n_close += 1
             if n_close > 0:

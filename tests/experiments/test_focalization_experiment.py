@@ -60,7 +60,7 @@ def test_information_of_a_scan_is_its_mean_log_likelihood_ratio():
             measured,
             np.array(setting.detection_probability),
             np.array([TDOA_STD_S]),
-            2.0,
+            2.0 / MAX_TDOA_S,
             (0.0, MAX_TDOA_S),
         )
         gains.append(llr[0])

@@ -14,6 +14,7 @@ PAPER = FocalizationConfig(
     tdoa_std_s=(5e-4,),
     false_alarms=1.0,
     false_alarm_memory_s=INF,
+    false_alarm_resolution_s=0.0,
     min_tdoa_s=0.0,
     max_tdoa_s=0.1,
     max_range_m=5000.0,
@@ -119,7 +120,7 @@ def test_posterior_and_evidence_are_those_of_a_grid_of_straight_tracks():
         inside = np.abs(ranges) < 1500.0
         predicted = model.tdoas(np.abs(ranges).ravel(), np.zeros(ranges.size), 20.0)
         llr, _ = association_log_likelihood(
-            predicted, measured, np.array([0.8, 0.6, 0.7]), np.array([4e-3, 3e-3, 5e-3]), 2.0, (0.0, 0.1)
+            predicted, measured, np.array([0.8, 0.6, 0.7]), np.array([4e-3, 3e-3, 5e-3]), 20.0, (0.0, 0.1)
         )
         posterior = posterior * inside * np.exp(llr).reshape(ranges.shape)
         weights = posterior / posterior.sum()

@@ -11,9 +11,8 @@ from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.trackers.tdoa_association import ImageModel, TableModel, association_log_likelihood
 
 
-def enumerate_associations(predicted, measured, detection, std, false_alarms, window):
+def enumerate_associations(predicted, measured, detection, std, density, window):
     """Sum and mean count over all association vectors, one source, written out."""
-    density = false_alarms / (window[1] - window[0])
     total, served = 0.0, 0.0
     for vector in product(range(len(measured) + 1), repeat=len(predicted)):
         used = [m for m in vector if m]
@@ -25,7 +24,7 @@ def enumerate_associations(predicted, measured, detection, std, false_alarms, wi
             probability = detection[pair] if exists else 0.0
             if m:
                 term *= (
-                    probability * norm.pdf(measured[m - 1], predicted[pair], std[pair]) / density
+                    probability * norm.pdf(measured[m - 1], predicted[pair], std[pair]) / density[m - 1]
                     if exists
                     else 0.0
                 )
@@ -47,8 +46,9 @@ def test_sum_over_associations_is_that_of_the_enumeration(n_pair, n_measured):
     std = rng.uniform(0.02, 0.3, n_pair)
     detection = rng.uniform(0.0, 1.0, n_pair)
     measured = rng.uniform(*window, n_measured)
-    found, served = association_log_likelihood(predicted, measured, detection, std, 1.7, window)
-    slow = np.array([enumerate_associations(p, measured, detection, std, 1.7, window) for p in predicted])
+    density = rng.uniform(0.5, 4.0, n_measured)
+    found, served = association_log_likelihood(predicted, measured, detection, std, density, window)
+    slow = np.array([enumerate_associations(p, measured, detection, std, density, window) for p in predicted])
     np.testing.assert_allclose(found, slow[:, 0], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(served, slow[:, 1], rtol=1e-12, atol=1e-12)
 
