@@ -340,8 +340,7 @@ class FocalizationFilter:
         return log_evidence, self.existence * float(np.exp(self._log_weights) @ explained)
 
     def _unexplained(self, measured: np.ndarray, receiver_depth_m: float | None) -> np.ndarray:
-        """Probability that the source did not make each measurement: what the likelihood would be without
-        it."""
+        """Probability that the source did not make each measurement, from the likelihood without it."""
         some = self._particles[systematic_resampling(self._log_weights, self._rng, EXPLAINING)]
         whole, _ = self._likelihood(some, measured, receiver_depth_m)
         without = [
