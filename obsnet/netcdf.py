@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import os
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -32,6 +32,7 @@ class TimeWriter:
         self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         self._attrs = attrs or {}
         self._file: Any = None
+        self._bytes: _PatientFile | None = None
 
     def append(self, block: xr.Dataset) -> None:
         """Write the next block; the first one sets variables, coordinates and dims."""
@@ -47,20 +48,22 @@ class TimeWriter:
             for name, values in _real(block).items():
                 self._file.variables[name][time:stop] = _pack(name, values.transpose("time", ...).values)
         except OSError as error:
-            raise OutputError(f"cannot write {self.path}: {error}") from None
+            raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from None
+        self._require_written()
 
     def close(self) -> None:
         """Finish the file and move it to its name."""
         if self._file is None:
             return
         try:
-            self._file.close()
+            self._release()
+            self._require_written()
             os.replace(self._partial, self.path)
-        except (OSError, RuntimeError) as error:  # HDF5 meets a full disk when it flushes
+        except OSError as error:
             self._partial.unlink(missing_ok=True)
-            raise OutputError(f"cannot write {self.path}: {error}") from None
-        finally:
-            self._file = None
+            if isinstance(error, OutputError):
+                raise
+            raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from None
 
     def __enter__(self) -> TimeWriter:
         return self
@@ -71,14 +74,24 @@ class TimeWriter:
         if kind is None:
             self.close()
             return
-        if self._file is not None:
-            with suppress(OSError, RuntimeError):
-                self._file.close()
+        self._release()
         self._partial.unlink(missing_ok=True)
+
+    def _release(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        if self._bytes is not None:
+            self._bytes.close()
+        self._file = None
+
+    def _require_written(self) -> None:
+        if self._bytes is not None and self._bytes.failure is not None:
+            raise OutputError(f"cannot write {self.path}: {self._bytes.failure.strerror}")
 
     def _create(self, block: xr.Dataset) -> Any:
         self._partial.parent.mkdir(parents=True, exist_ok=True)
-        file = h5netcdf.File(self._partial, "w")
+        self._bytes = _PatientFile(self._partial, "w+")
+        file = h5netcdf.File(self._bytes, "w")
         file.attrs["Conventions"] = "CF-1.11"
         for key, value in self._attrs.items():
             file.attrs[key] = value
@@ -109,6 +122,31 @@ class TimeWriter:
             if packed:
                 variable.attrs.update({"scale_factor": np.float32(PACKED[name])})
         return file
+
+
+class _PatientFile(io.FileIO):
+    """A file that keeps its first failure for the writer to ask about: a write that fails makes HDF5 crash."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of `data`, or pretend to."""
+        view = memoryview(data).cast("B")
+        done = 0
+        try:
+            while self.failure is None and done < len(view):
+                done += super().write(view[done:]) or 0
+        except OSError as error:
+            self.failure = error
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the length, or pretend to."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
 
 
 def read(path: str | Path) -> xr.Dataset:

@@ -52,6 +52,8 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
         try:
             yield stage
             _move(stage, target, leftovers)
+        except OutputError as error:
+            raise OutputError(str(error).replace(str(stage), str(target))) from None
         finally:
             shutil.rmtree(stage, ignore_errors=True)
     finally:

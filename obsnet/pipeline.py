@@ -7,7 +7,7 @@ were cut into blocks, and its memory does not grow with the record.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
 import numpy as np
 import pandas as pd
@@ -32,7 +32,9 @@ from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
 from obsnet.trackers.grid_search import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
-from obsnet.trackers.station_focalization import StationFocalization, StationScans
+
+if TYPE_CHECKING:
+    from obsnet.trackers.station_focalization import StationFocalization, StationScans
 
 LONG_SILENCE_S = 86400.0
 """A silence longer than this has no rows; the record goes on after it as if it began there."""
@@ -108,7 +110,7 @@ class Pipeline:
         self._null: np.ndarray | None = None
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
-        self._follower = StationFocalization(self.table) if config.tracker == "focalization" else None
+        self._follower = _follower(self.table) if config.tracker == "focalization" else None
         self._followed: list[StationScans] = []
         self._next: float | None = None
         self._last: float | None = None
@@ -210,6 +212,12 @@ class Pipeline:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+
+
+def _follower(table: xr.Dataset) -> StationFocalization:
+    from obsnet.trackers.station_focalization import StationFocalization
+
+    return StationFocalization(table)
 
 
 def _power(spectra: xr.Dataset) -> xr.DataArray:

@@ -34,8 +34,6 @@ from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
-from obsnet.trackers.bearings_only import track_bearings
-from obsnet.trackers.bernoulli import track_azimuth
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import Segment, Track
@@ -236,6 +234,8 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
 
 def _followed(run: Run) -> list[Segment]:
     """Segments in which the Bernoulli filter, minute by minute, holds a ship for sure (existence over 0.9)."""
+    from obsnet.trackers.bernoulli import track_azimuth
+
     if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
         raise ConfigError(
             "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
@@ -267,6 +267,8 @@ def _range_heard(run: Run, segment: Segment) -> bool:
 
 def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray]) -> list[Track]:
     """Track from the azimuths alone, for a segment in which no range was heard; speed is then a prior's."""
+    from obsnet.trackers.bearings_only import track_bearings
+
     inside = (run.presence.index >= segment.start) & (run.presence.index <= segment.end)
     azimuth = run.detections["azimuth_deg"].to_numpy(float)[inside]
     if np.isfinite(azimuth).sum() < 30 or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:

@@ -86,8 +86,8 @@ def draw(result: Result, path: str | Path) -> None:
         axes[2, column].set_xlabel("time (s)")
     for row, label in enumerate(("delay (ms)", "range (m)", "RMSE of range (m)")):
         axes[row, 0].set_ylabel(label)
-    for row in range(3):
-        axes[row, 0].legend(fontsize=8, loc="upper right")
+    for row, place in enumerate(("upper right", "upper right", "lower left")):
+        axes[row, 0].legend(fontsize=8, loc=place)
     figure.suptitle(f"Probabilistic focalization, simulated delays: {result.runs} runs", size=12)
     figure.savefig(path, dpi=130)
 

@@ -52,7 +52,7 @@ def tabulate(
     across, along : (n_cpa_range, n_speed, n_offset) float32, overwritten with positions on the range and rate axes.
     row : the same shape, int32, overwritten with the start of the courses in the flattened azimuth row.
     """
-    bins = int(round(360.0 / azimuth_step))
+    bins = int(360.0 / azimuth_step + 0.5)
     for i in range(cpa_range.shape[0]):
         for j in range(speed.shape[0]):
             for k in range(offset.shape[0]):

@@ -7,6 +7,7 @@ followed by an approach a second ship has come, and the segment is split.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -92,7 +93,7 @@ def _split(time: np.ndarray, phase: np.ndarray, lo: int, hi: int) -> list[Segmen
     runs = sorted(((a + lo, b + lo, sign) for sign, a, b in runs))
     pieces: list[Segment] = []
     start, cpa = time[lo], None
-    for (_, end, sign), (begin, _, following) in zip(runs[:-1], runs[1:], strict=True):
+    for (_, end, sign), (begin, _, following) in pairwise(runs):
         middle = 0.5 * (time[end - 1] + time[begin])
         if sign == -1 and following == 1:
             cpa = middle
