@@ -86,7 +86,7 @@ class TimeWriter:
 
     def _require_written(self) -> None:
         if self._bytes is not None and self._bytes.failure is not None:
-            raise OutputError(f"cannot write {self.path}: {self._bytes.failure.strerror}")
+            raise OutputError(f"cannot write {self.path}: {self._bytes.failure.strerror}; make room for it")
 
     def _create(self, block: xr.Dataset) -> Any:
         self._partial.parent.mkdir(parents=True, exist_ok=True)
