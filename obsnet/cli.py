@@ -92,7 +92,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             console.flush()
         except (KeyboardInterrupt, typer.Abort):
             sys.exit(130)
-        except BrokenPipeError:
+        except (BrokenPipeError, SystemExit) as leaving:
+            # typer and rich leave with 1 when nobody reads the help any more
+            if not any(isinstance(error, BrokenPipeError) for error in (leaving, leaving.__context__)):
+                raise
             console.hush()
             sys.exit(0)
         except Exception as error:
