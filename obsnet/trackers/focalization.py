@@ -29,7 +29,9 @@ class FocalizationConfig:
 
     Parameters
     ----------
-    detection_probability : per pair, where both its paths exist; one value serves every pair.
+    detection_probability : per pair, where both its paths exist; one value serves every pair. What is not
+        heard stays unheard for many scans, so that misses say less than their number: take less than the
+        share of scans in which a clear pair is detected.
     tdoa_std_s : standard deviation of a measured delay, s, per pair or one for all.
     false_alarms : mean number per scan, uniform between `min_tdoa_s` and `max_tdoa_s`, outside of which no
         delay is looked at.
@@ -52,7 +54,7 @@ class FocalizationConfig:
     birth_share : births per scan as a share of J, with as much weight as birth and jump give them.
     """
 
-    detection_probability: tuple[float, ...] = (0.2,)
+    detection_probability: tuple[float, ...] = (0.3,)
     tdoa_std_s: tuple[float, ...] = (0.02,)
     false_alarms: float = 2.0
     false_alarm_memory_s: float = 1200.0

@@ -126,8 +126,8 @@ class StationFocalization:
     ----------
     table : propagation table, dims (path, range).
     config : StationFocalizationConfig
-    amplitudes : cepstral amplitude of each pair against range, where it is known: it tells where a pair
-        cannot be seen.
+    amplitudes : cepstral amplitude of each pair against range: it tells where a pair cannot be seen. By
+        default the analytic range detector's, scaled to the table's `depth_m`; none where it has no depth.
     """
 
     def __init__(
@@ -138,6 +138,9 @@ class StationFocalization:
     ) -> None:
         self.config = config
         pairs = config.pairs or tuple(f"{a}-{b}" for a, b in pairwise(table["path"].values.tolist()))
+        if amplitudes is None and "depth_m" in table.attrs:
+            standard = Amplitudes.default().scaled_to(float(table.attrs["depth_m"]))
+            amplitudes = standard if set(pairs) <= set(standard.pairs) else None
         self.model = TableModel(table, pairs, amplitudes, config.half_amplitude)
         self.filter = FocalizationFilter(self.model, config.filter)
         self._time = -np.inf
@@ -266,7 +269,7 @@ def focalize_station(
     times_s : array, dims (time,), s since 1970, increasing.
     table : propagation table of the station, dims (path, range).
     config : StationFocalizationConfig
-    amplitudes : cepstral amplitude of each pair against range, where it is known.
+    amplitudes : as for `StationFocalization`.
 
     Returns
     -------

@@ -153,6 +153,30 @@ def test_what_is_heard_left_the_ship_earlier(table):
     np.testing.assert_allclose(scans.travel_time_s, expected, atol=0.01)
 
 
+def test_amplitudes_come_with_the_depth_of_the_table(table):
+    deep = table.assign_attrs(depth_m=DEPTH)
+    at = np.array([12e3, 30e3])
+    known = StationFocalization(table, CONFIG, AMPLITUDES).model.visibility(at)
+    np.testing.assert_allclose(StationFocalization(deep, CONFIG).model.visibility(at), known)
+    np.testing.assert_allclose(StationFocalization(table, CONFIG).model.visibility(at), 1.0)
+
+
+def test_harmonics_that_stay_put_do_not_draw_the_filter_to_a_standing_ghost(table):
+    times, values, distance = simulate(StraightCourse(0.0, 9e3, 30.0, 7.5), -3600, 2400, 1.0, 8)
+    near = np.abs(times) < 1200
+    for line in 0.72 * np.arange(1, 9):
+        lag = QUEFRENCY[:, None] - line - 0.002 * np.sin(times[near] / 200.0)
+        values[:, near] += 0.05 * np.cos(2 * np.pi * 15.0 * lag) * np.exp(-0.5 * (lag / 0.05) ** 2)
+
+    def share(config):
+        scans = focalize_station(values, QUEFRENCY, times, table, config, AMPLITUDES)
+        truth = np.interp(scans.time_s, times, distance)
+        return np.mean(np.abs(scans.range_mode_m - truth)[scans.time_s > -1200] < 500.0)
+
+    uniform = replace(CONFIG, filter=replace(CONFIG.filter, false_alarm_resolution_s=0.0))
+    assert share(CONFIG) > 0.9 > 0.6 > share(uniform)
+
+
 def test_bad_input_is_refused(table):
     with pytest.raises(ConfigError, match="must look at the same delays"):
         replace(CONFIG, filter=replace(CONFIG.filter, max_tdoa_s=5.0))
