@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import re
 import types
 import typing
@@ -124,7 +125,9 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         return tuple(_convert(element, item, f"{path}[{i}]") for i, element in enumerate(value))
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, path)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    if hint is float and type(value) in (int, float):
+        if not math.isfinite(value):
+            raise ConfigError(f"{path} must be a finite number, found {value}")
         return float(value)
     if hint in (str, Path) and isinstance(value, (str, Path)):
         return hint(value)

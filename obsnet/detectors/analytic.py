@@ -22,11 +22,14 @@ from obsnet.detectors.maps import coverage, window_bounds
 from obsnet.errors import ConfigError
 from obsnet.layout import AZIGRAM, CEPSTROGRAM, from_posix, require, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import phase_difference, tdoa
+from obsnet.ocean.rays import parse_pair, phase_difference, tdoa
 from obsnet.signals.cepstrogram import noise_std
 
 EXPONENT_LIMIT = 690.0
 """Largest log that a float64 product can hold."""
+
+MOST_CELLS = 2e6
+"""Cells of range and closing range rate that a minute may have; the default has 2e4."""
 
 UNHEARD = 1e-3
 """Cepstral amplitude, a tenth of the noise of a 1024-sample frame, below which a pair counts as silent."""
@@ -61,10 +64,16 @@ class AzimuthDetectorConfig:
         _check_windows(self.window_s, self.step_s)
         if not 0.0 < self.mean_resultant_length < 1.0:
             raise ConfigError(f"mean_resultant_length must lie in (0, 1), found {self.mean_resultant_length}")
-        if abs(360.0 / self.azimuth_step_deg - round(360.0 / self.azimuth_step_deg)) > 1e-9:
-            raise ConfigError(f"azimuth_step_deg must divide 360, found {self.azimuth_step_deg}")
+        step = self.azimuth_step_deg
+        if not 0.01 <= step <= 90.0 or abs(360.0 / step - round(360.0 / step)) > 1e-9:
+            raise ConfigError(f"azimuth_step_deg must divide 360 and lie between 0.01 and 90, found {step}")
         if not 0.0 < self.detection_probability < 1.0:
             raise ConfigError(f"detection_probability must lie in (0, 1), found {self.detection_probability}")
+        if not 0.0 < self.background_step_s <= self.background_window_s:
+            raise ConfigError(
+                "background_step_s must be positive and at most background_window_s, found "
+                f"{self.background_step_s} and {self.background_window_s} s"
+            )
 
     @property
     def azimuth(self) -> np.ndarray:
@@ -107,6 +116,13 @@ class RangeDetectorConfig:
             raise ConfigError(f"wander_bins must not be negative, found {self.wander_bins}")
         if not self.pairs:
             raise ConfigError("pairs must name one path pair at least, such as '1-3'")
+        for pair in self.pairs:
+            parse_pair(pair)
+        cells = self.max_range_m / self.range_step_m * self.max_range_rate_mps / self.range_rate_step_mps
+        if not cells <= MOST_CELLS:
+            raise ConfigError(
+                f"range_step_m and range_rate_step_mps make a grid of {2 * cells:.0e} cells; make them coarser"
+            )
 
     @property
     def range_m(self) -> np.ndarray:
@@ -342,6 +358,9 @@ def cepstral_model(
     (A_j/A_i) exp(−iωτ_ij) enters log|1 + …| as its real part, whose inverse transform has its pulse at +τ_ij, and
     ∫ S(f) cos(ωτ_ij − Δφ) cos(ωτ) df over a band around f0 is an envelope times cos(2π f0 (τ − τ_ij) + Δφ).
     """
+    if not set(config.pairs) & set(amplitudes.pairs):
+        known = ", ".join(amplitudes.pairs)
+        raise ConfigError(f"no amplitude is known of the pairs {', '.join(config.pairs)}; known are {known}")
     range_m = config.range_m
     factor = 2.0 if config.pulse == "text" else 1.0
     model = np.zeros((len(config.pairs), len(range_m), len(quefrency_s)))

@@ -12,6 +12,7 @@ import numpy as np
 from obsnet.errors import ConfigError
 from obsnet.ocean.bottom import Bottom
 
+MOST_NODES, MOST_RANGES = 100_000, 1_000_000
 PRESSURE_GRADIENT = 0.0163
 """Growth of sound speed with depth in water of one temperature and salinity, (m/s)/m."""
 
@@ -63,8 +64,11 @@ class Munk:
 
         # Steps of √(8·error/c″), c″ ∝ e^−ζ: equal steps of e^(−ζ/2).
         step = np.sqrt(8.0 * error_mps / max(curvature, 1e-12))
-        count = int(np.ceil((scale(top) - scale(depth_m)) / step)) + 1
-        levels = np.linspace(scale(top), scale(depth_m), max(count, 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = np.ceil((scale(top) - scale(depth_m)) / step)
+        if not steps < MOST_NODES or scale(depth_m) == 0.0:
+            raise ConfigError(f"no ocean has the sound speeds of {self}; correct its numbers")
+        levels = np.linspace(scale(top), scale(depth_m), max(int(steps) + 1, 2))
         depths = self.axis_depth_m - self.scale_m * np.log(levels / self.scale_m)
         depths[0], depths[-1] = top, depth_m
         return np.unique(np.concatenate(([0.0], depths)))
@@ -236,6 +240,13 @@ class OceanConfig:
                 f"range_step_m must be > 0 and below max_range_m ({self.max_range_m:g}), "
                 f"found {self.range_step_m:g}"
             )
+        if not self.max_range_m / self.range_step_m <= MOST_RANGES:
+            raise ConfigError(
+                f"range_step_m must make at most {MOST_RANGES} ranges up to max_range_m ({self.max_range_m:g}), "
+                f"found {self.range_step_m:g}"
+            )
+        if self.table_file and self.profile != "table":
+            raise ConfigError(f"table_file is for profile 'table', found profile {self.profile!r}")
 
     def sound_speed(self) -> SoundSpeed:
         """Build the profile that this configuration names."""
