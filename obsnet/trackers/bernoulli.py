@@ -46,7 +46,9 @@ class AzimuthTrackerConfig:
     detection_probability: float = 0.9
     weight: float = 1.0 / 3.0
     bernoulli: BernoulliConfig = field(
-        default_factory=lambda: BernoulliConfig(survival=0.99, birth=1 / 300, particles=2000, births=500)
+        default_factory=lambda: BernoulliConfig(
+            survival=0.99, birth=1 / 300, replacement=1e-3, particles=2000, births=500
+        )
     )
 
     def __post_init__(self) -> None:

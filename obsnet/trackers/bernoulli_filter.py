@@ -36,6 +36,9 @@ class BernoulliConfig:
         p_s and p_b, probabilities that a target goes on existing and that one appears.
     confirmation : float
         A target is confirmed while q exceeds this.
+    replacement : float
+        Share of the surviving targets whose state is drawn afresh from the births, 0 in the paper: a second target
+        takes the place of the first, and a filter that follows a wrong branch finds the right one.
     particles, births : int
         Particles kept after a batch, and new ones that the caller adds before the next.
     """
@@ -43,6 +46,7 @@ class BernoulliConfig:
     survival: float = 0.9999
     birth: float = 1e-5
     confirmation: float = 0.9
+    replacement: float = 0.0
     particles: int = 1000
     births: int = 250
 
@@ -50,6 +54,8 @@ class BernoulliConfig:
         for name in ("survival", "birth", "confirmation"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ConfigError(f"{name} must lie between 0 and 1, found {getattr(self, name)!r}")
+        if not 0.0 <= self.replacement < 1.0:
+            raise ConfigError(f"replacement must lie in [0, 1), found {self.replacement!r}")
         if self.particles < 1 or self.births < 1:
             raise ConfigError(
                 f"particles and births must be at least 1, found {self.particles} and {self.births}"
@@ -117,8 +123,9 @@ class BernoulliFilter:
         old = self.states.shape[1]
         states = np.concatenate([propagate(self.states), births], axis=1)
         weights = np.empty(states.shape[1])
-        weights[:old] = _log(survived / predicted / old)
-        weights[old:] = _log(appeared / predicted)
+        replaced = config.replacement * survived
+        weights[:old] = _log((survived - replaced) / predicted / old)
+        weights[old:] = _log((appeared + replaced) / predicted)
         if birth_log_weights is None:
             weights[old:] -= np.log(births.shape[1])
         else:

@@ -34,10 +34,13 @@ class StationTrackerConfig:
     scale_drift : float
         While there is no range map, position and velocity are scaled together by a random factor of this
         relative size per interval: azimuths do not tell it, and a few particles would pretend to know it.
+    turn_drift_deg : float
+        Position and velocity are turned together about the station by a random angle of this size per interval: a
+        sharp range map, which does not tell it, otherwise leaves a handful of azimuths to choose from.
     speed_std_mps : float
         Spread of each component of a newborn ship's velocity that the maps do not tell.
     max_range_m : float
-        Ships are born up to here, uniformly over the area.
+        Ships are born up to here, uniformly over the area, and exist up to twice as far.
     azimuth_detection, range_detection : float
         P_d of either map, as in `AzimuthTrackerConfig`.
     weight : float
@@ -48,13 +51,16 @@ class StationTrackerConfig:
     interval_s: float = 60.0
     acceleration_mps2: float = 2e-3
     scale_drift: float = 0.03
+    turn_drift_deg: float = 0.5
     speed_std_mps: float = 6.0
     max_range_m: float = 50e3
     azimuth_detection: float = 0.9
     range_detection: float = 0.6
     weight: float = 1.0 / 3.0
     bernoulli: BernoulliConfig = field(
-        default_factory=lambda: BernoulliConfig(survival=0.99, birth=1 / 300, particles=4000, births=2000)
+        default_factory=lambda: BernoulliConfig(
+            survival=0.99, birth=1 / 300, replacement=1e-4, particles=4000, births=2000
+        )
     )
 
     def __post_init__(self) -> None:
@@ -64,10 +70,10 @@ class StationTrackerConfig:
         if not (
             0 < self.azimuth_detection <= 1
             and 0 < self.range_detection <= 1
-            and min(self.acceleration_mps2, self.scale_drift) >= 0
+            and min(self.acceleration_mps2, self.scale_drift, self.turn_drift_deg) >= 0
         ):
             raise ConfigError(
-                "detection probabilities must lie in (0, 1], acceleration and drift not be negative"
+                "detection probabilities must lie in (0, 1], acceleration and drifts not be negative"
             )
 
 
@@ -202,7 +208,7 @@ class StationTracker:
     def _llr(self, states: np.ndarray, row: np.ndarray | None, chart: np.ndarray | None) -> np.ndarray:
         east, north, east_rate, north_rate = states
         distance = np.maximum(np.hypot(east, north), 1.0)
-        total = np.zeros(states.shape[1])
+        total = np.where(distance > 2.0 * self.config.max_range_m, -np.inf, 0.0)
         if row is not None:
             total += self._azimuth(row, np.rad2deg(np.arctan2(east, north)))
         if chart is not None:
@@ -254,7 +260,18 @@ class StationTracker:
         interval = self.config.interval_s
         kick = self.config.acceleration_mps2 * interval * rng.standard_normal((2, states.shape[1]))
         moved = np.concatenate([states[:2] + interval * (states[2:] + 0.5 * kick), states[2:] + kick])
-        return moved if drift == 0.0 else moved * np.exp(drift * rng.standard_normal(states.shape[1]))
+        factor = np.exp(drift * rng.standard_normal(states.shape[1]))
+        turn = np.deg2rad(self.config.turn_drift_deg) * rng.standard_normal(states.shape[1])
+        cos, sin = factor * np.cos(turn), factor * np.sin(turn)
+        east, north, east_rate, north_rate = moved
+        return np.stack(
+            [
+                cos * east + sin * north,
+                cos * north - sin * east,
+                cos * east_rate + sin * north_rate,
+                cos * north_rate - sin * east_rate,
+            ]
+        )
 
 
 @dataclass(frozen=True)

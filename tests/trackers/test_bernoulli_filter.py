@@ -98,6 +98,21 @@ def test_weighted_births_are_worth_births_drawn_with_those_weights():
     assert existences[0] == pytest.approx(existences[1], rel=0.01)
 
 
+def test_a_replaced_share_lets_a_filter_leave_a_wrong_branch_without_changing_the_existence():
+    rng = np.random.default_rng(7)
+    found = []
+    for replacement in (0.0, 0.05):
+        config = BernoulliConfig(
+            survival=0.9, birth=0.1, replacement=replacement, particles=2000, births=1000
+        )
+        filter_ = BernoulliFilter(config, np.full((1, 2000), 3.0), existence=0.999999)
+        filter_.step(still, np.full((1, 1000), 15.0), None, rng)
+        assert filter_.existence == pytest.approx(0.9, rel=1e-5)
+        found.append(np.mean(filter_.states[0] == 15.0))
+    assert found[0] < 1e-3
+    assert found[1] == pytest.approx(0.05, abs=1e-3)
+
+
 def test_certainty_neither_overflows_nor_sticks():
     config = BernoulliConfig(survival=0.999, birth=1e-5, particles=10, births=10)
     rng = np.random.default_rng(4)
@@ -139,6 +154,7 @@ def test_motion_has_the_covariance_of_white_acceleration():
         ({"survival": 1.0}, "survival must lie between 0 and 1, found 1.0"),
         ({"birth": 0.0}, "birth"),
         ({"confirmation": 1.5}, "confirmation"),
+        ({"replacement": 1.0}, "replacement"),
         ({"particles": 0}, "particles"),
     ],
 )
