@@ -137,9 +137,12 @@ def click_errors(
 
 def track_errors(
     found: Association, paths: list[AnimalPath], array: CompactArray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Errors [deg] of the smoothed tracks at their clicks, each against the animal that it follows best."""
-    turns, rises = [np.empty(0)], [np.empty(0)]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors [deg] of the smoothed tracks at their clicks, each against the animal that it follows best.
+
+    The third array holds the mean of the two squared errors, each over the variance that the track states.
+    """
+    turns, rises, over = [np.empty(0)], [np.empty(0)], [np.empty(0)]
     for track in found.tracks:
         candidates = []
         for path in paths:
@@ -149,7 +152,16 @@ def track_errors(
         turn, rise = min(candidates, key=lambda errors: float((errors[0] ** 2 + errors[1] ** 2).sum()))
         turns.append(turn)
         rises.append(rise)
-    return np.concatenate(turns), np.concatenate(rises)
+        over.append(over_stated(track, turn, rise, track.clicked))
+    return np.concatenate(turns), np.concatenate(rises), np.concatenate(over)
+
+
+def over_stated(
+    track: AnimalTrack, turn: np.ndarray, rise: np.ndarray, at: np.ndarray | slice = slice(None)
+) -> np.ndarray:
+    """Mean of the squared errors of azimuth and elevation, each over the variance that the smoother states."""
+    variance = np.diagonal(track.smoothed_covariance, axis1=1, axis2=2)[at]
+    return (turn**2 / variance[:, 0] + rise**2 / variance[:, 1]) / 2.0
 
 
 def range_errors(

@@ -46,6 +46,7 @@ from obsnet.experiments.click_scores import (
     click_errors,
     merged,
     nearest_arrival,
+    over_stated,
     own_tdoas,
     owner_of,
     range_errors,
@@ -66,7 +67,7 @@ MOST_RECORDINGS = 8
 
 
 def reproduce(
-    runs: int = 100, seed: int = 0, progress: montecarlo.Progress | None = None, jobs: int = 1
+    runs: int = 50, seed: int = 0, progress: montecarlo.Progress | None = None, jobs: int = 1
 ) -> Result:
     """Run the three scenarios.
 
@@ -112,11 +113,9 @@ def clutter(rng: np.random.Generator) -> dict[str, float]:
     track = found.tracks[number]
     here = np.searchsorted(scene.time, track.time)
     turn, rise = wrap180(track.azimuth_deg - azimuth[here]), track.elevation_deg - elevation[here]
-    spread = np.diagonal(track.smoothed_covariance, axis1=1, axis2=2)
-    normalised = (turn**2 / spread[:, 0] + rise**2 / spread[:, 1]) / 2.0
     outcome |= squares("smoother", turn, rise)
     outcome |= squares("filter", track.filtered[:, 0] - azimuth[here], track.filtered[:, 1] - elevation[here])
-    outcome["smoother_normalised"] = float(normalised.sum())
+    outcome["smoother_normalised"] = float(over_stated(track, turn, rise).sum())
     return outcome
 
 
@@ -152,7 +151,9 @@ def recording(rng: np.random.Generator) -> dict[str, float]:
     }
     errors = click_errors(record, paths, animal[which], near & accepted, array)
     outcome |= squares("clicks", *errors)
-    outcome |= squares("tracks", *track_errors(found, paths, array))
+    turn, rise, over = track_errors(found, paths, array)
+    outcome |= squares("tracks", turn, rise)
+    outcome["tracks_normalised"] = float(over.sum())
     outcome |= range_errors(record, paths, animal[which], near)
     return outcome
 

@@ -55,6 +55,7 @@ def lines(result: Result) -> list[str]:
         ("  false clicks a minute", f"{wav['false_clicks']:.2f}", "-"),
         ("  point by point, azimuth / elevation RMSE", _both(wav, "click_"), "-"),
         ("  smoother, azimuth / elevation RMSE", _both(wav, ""), "-"),
+        ("  smoother's errors over those it states", f"{wav['error_over_stated']:.2f}", "-"),
         ("  tracks an animal", f"{wav['tracks_per_animal']:.2f}", "-"),
         ("  ranges from echoes, within 10 %", f"{wav['echo_ranges_within_10_percent']:.1%}", "20 by hand"),
         ("  their RMSE", f"{wav['range_rmse_percent']:.2f} %", "-"),

@@ -31,6 +31,11 @@ class Result:
         count = self.total(outcomes, f"{name}_count")
         return float(np.sqrt(self.total(outcomes, f"{name}_{angle}") / count)) if count else None
 
+    def over_stated(self, outcomes: list[dict[str, float]], name: str) -> float:
+        """Root mean square of errors over the standard deviations that the smoother states."""
+        count = self.total(outcomes, f"{name}_count")
+        return float(np.sqrt(self.total(outcomes, f"{name}_normalised") / max(count, 1.0)))
+
     def share(self, outcomes: list[dict[str, float]], part: str, whole: str) -> float:
         """Share of one count in another, over all runs."""
         return self.total(outcomes, part) / max(self.total(outcomes, whole), 1.0)
@@ -38,7 +43,6 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """Plain numbers; all of simulated data."""
         one = self.clutter
-        calibration = self.total(one, "smoother_normalised") / max(self.total(one, "smoother_count"), 1.0)
         return {
             "experiment": "clicks",
             "simulated": True,
@@ -55,7 +59,7 @@ class Result:
             "regression_in_clutter_azimuth_rmse_deg": self.rmse(one, "naive", "azimuth"),
             "regression_in_clutter_elevation_rmse_deg": self.rmse(one, "naive", "elevation"),
             "tracks_per_run": self.total(one, "tracks") / self.runs,
-            "error_over_stated": float(np.sqrt(calibration)),
+            "error_over_stated": self.over_stated(one, "smoother"),
             "two_animals": self._two_animals(),
             "recordings": self._recordings(),
         }
@@ -79,6 +83,7 @@ class Result:
             "click_elevation_rmse_deg": self.rmse(these, "clicks", "elevation"),
             "azimuth_rmse_deg": self.rmse(these, "tracks", "azimuth"),
             "elevation_rmse_deg": self.rmse(these, "tracks", "elevation"),
+            "error_over_stated": self.over_stated(these, "tracks"),
             "tracks_per_animal": self.share(these, "tracks", "animals"),
             "echo_ranges": self.total(these, "ranged"),
             "echo_ranges_within_10_percent": self.share(these, "ranged_right", "ranged"),

@@ -43,6 +43,7 @@ def test_recordings_go_from_samples_to_tracks(result):
     assert values["clicks_found"] > 0.85 and values["false_clicks"] <= 1.0
     assert values["azimuth_rmse_deg"] < values["click_azimuth_rmse_deg"] < 0.5
     assert values["elevation_rmse_deg"] < values["click_elevation_rmse_deg"] < 0.5
+    assert 0.2 < values["error_over_stated"] < 1.5
     assert values["tracks_per_animal"] == pytest.approx(1.0, abs=0.3)
 
 
