@@ -1,0 +1,241 @@
+"""What a run's folder holds: the columns, times and values that scripts depend on."""
+
+import copy
+import json
+import re
+
+import numpy as np
+import obspy
+import pandas as pd
+import pytest
+import xarray as xr
+from pyproj import Geod
+
+from .conftest import HOURS, START
+
+DETECTIONS = "time,coverage,azimuth_deg,azimuth_llr,range_m,range_rate_mps,range_llr"
+TRACKS = (
+    "track,start,end,cpa_time,cpa_distance_m,cpa_azimuth_deg,course_deg,speed_mps,cpa_time_std_s,"
+    "cpa_distance_std_m,course_std_deg,speed_std_mps,log_bayes_factor"
+)
+FILES = {
+    "detections.csv", "tracks.csv", "tracks.geojson", "maps.nc", "features.nc", "report.png", "run.json",
+}  # fmt: skip
+UTC = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?Z")
+
+
+def detections(folder):
+    return pd.read_csv(folder / "detections.csv")
+
+
+def notes(folder):
+    info = json.loads((folder / "run.json").read_text())
+    return " ".join(info["notes"] + info["waveforms"]["notes"])
+
+
+def only(inventory, path, *codes, change=lambda channel: None):
+    """StationXML with some of the channels."""
+    kept = copy.deepcopy(inventory)
+    kept[0][0].channels = [channel for channel in kept[0][0] if channel.code in codes]
+    for channel in kept[0][0]:
+        change(channel)
+    kept.write(str(path), "STATIONXML")
+    return path
+
+
+def test_the_files_and_nothing_else(finished):
+    assert {path.name for path in finished.iterdir()} == FILES
+    assert (finished / "report.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_detections_are_a_row_a_minute(finished):
+    assert (finished / "detections.csv").read_text().splitlines()[0] == DETECTIONS
+    rows = detections(finished)
+    assert rows["time"].str.fullmatch(UTC).all()
+    times = pd.to_datetime(rows["time"])
+    assert (times.diff().dropna() == pd.Timedelta("60s")).all()
+    assert len(rows) == 60 * HOURS - 1
+    assert rows["coverage"].between(0, 1).all()
+    covered = rows["coverage"] > 0
+    assert covered.all()
+    for ratio, estimates in (("azimuth_llr", ["azimuth_deg"]), ("range_llr", ["range_m", "range_rate_mps"])):
+        assert rows.loc[covered, ratio].notna().all()
+        for estimate in estimates:
+            np.testing.assert_array_equal(rows[estimate].notna(), rows[ratio] > 0)
+    assert rows["azimuth_deg"].dropna().between(0, 360, inclusive="left").all()
+
+
+def test_the_track_is_the_ship(finished):
+    assert (finished / "tracks.csv").read_text().splitlines()[0] == TRACKS
+    (row,) = pd.read_csv(finished / "tracks.csv").to_dict("records")
+    assert row["track"] == 1
+    assert all(UTC.fullmatch(row[name]) for name in ("start", "end", "cpa_time"))
+    assert abs(obspy.UTCDateTime(row["cpa_time"]) - (START + 3600)) < 60
+    assert row["cpa_distance_m"] == pytest.approx(6000, abs=500)
+    assert row["course_deg"] == pytest.approx(60, abs=2)
+    assert row["cpa_azimuth_deg"] == pytest.approx(150, abs=2)
+    assert row["speed_mps"] == pytest.approx(8, abs=0.5)
+    assert row["log_bayes_factor"] > 10
+
+
+def test_geojson_is_lines_in_wgs84_with_times(finished, inventory):
+    collection = json.loads((finished / "tracks.geojson").read_text())
+    assert collection["type"] == "FeatureCollection"
+    (feature,) = collection["features"]
+    assert feature["type"] == "Feature"
+    assert feature["geometry"]["type"] == "LineString"
+    coordinates = np.array(feature["geometry"]["coordinates"])
+    times = feature["properties"]["times"]
+    assert len(times) == len(coordinates) >= 2
+    assert all(UTC.fullmatch(time) for time in times)
+    station = inventory[0][0]
+    _, _, distance = Geod(ellps="WGS84").inv(
+        [station.longitude] * len(times), [station.latitude] * len(times), *coordinates.T
+    )
+    nearest = int(np.argmin(distance))
+    assert distance[nearest] == pytest.approx(6000, abs=700)
+    along, _, length = Geod(ellps="WGS84").inv(*coordinates[0], *coordinates[-1])
+    assert along % 360 == pytest.approx(60, abs=2)
+    seconds = obspy.UTCDateTime(times[-1]) - obspy.UTCDateTime(times[0])
+    assert length / seconds == pytest.approx(8, abs=0.5)
+
+
+def test_maps_are_cf_netcdf(finished):
+    with xr.open_dataset(finished / "maps.nc", engine="h5netcdf") as maps:
+        assert maps.attrs["Conventions"].startswith("CF-")
+        assert maps["azimuth_llr"].dims == ("time", "azimuth")
+        assert maps["range_llr"].dims == ("time", "range", "range_rate")
+        np.testing.assert_array_equal(
+            maps["time"].values, pd.to_datetime(detections(finished)["time"]).dt.tz_localize(None)
+        )
+
+
+def test_run_json_says_how(finished):
+    info = json.loads((finished / "run.json").read_text())
+    assert {
+        "config",
+        "versions",
+        "models",
+        "seconds",
+        "peak_memory_mb",
+        "station",
+        "waveforms",
+    } <= info.keys()
+    assert info["station"]["code"] == "XX.SIM01"
+    assert info["config"]["detector"] == "analytic"
+    assert info["seconds"].keys() >= {"spectra", "detect", "track"}
+    assert info["tracks"] == 1
+    assert UTC.fullmatch(info["start"])
+
+
+def test_no_ship_is_done(tracked, stream, tmp_path):
+    noise = stream.copy()
+    rng = np.random.default_rng(5)
+    for trace in noise:
+        trace.data = np.rint(rng.normal(0, 3000, trace.stats.npts)).astype(np.int32)
+    noise.write(str(tmp_path / "noise.mseed"), "MSEED")
+    out = tracked(tmp_path / "noise.mseed")
+    assert (out / "tracks.csv").read_text() == TRACKS + "\n"
+    assert json.loads((out / "tracks.geojson").read_text())["features"] == []
+    assert (detections(out)["azimuth_llr"] <= 0).mean() > 0.9
+
+
+def test_detect_is_the_same_without_tracks(tracked, finished):
+    out = tracked(command="detect")
+    assert (out / "detections.csv").read_bytes() == (finished / "detections.csv").read_bytes()
+    assert (out / "tracks.csv").read_text() == TRACKS + "\n"
+
+
+def test_any_split_of_the_record_gives_the_same_rows(tracked, finished, stream, tmp_path):
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    cuts = [0.0, 1000.01, 2222.2, 2222.22, 5000.0, 3600 * HOURS]
+    for number, trace in enumerate(stream):
+        for part in range(len(cuts) - 1):
+            piece = trace.slice(START + cuts[part], START + cuts[part + 1] - 0.01)
+            name = folder / f"{9 - part}-{number}.mseed"
+            piece.write(str(name), "MSEED", reclen=512, encoding="INT32" if part % 2 else "STEIM2")
+    expected = (finished / "detections.csv").read_bytes()
+    assert (tracked(folder) / "detections.csv").read_bytes() == expected
+    files = sorted(folder.iterdir(), reverse=True)
+    out = tracked([*files, files[3]], "--set", "spectra.block_s=777")
+    assert (out / "detections.csv").read_bytes() == expected
+    assert (out / "tracks.csv").read_bytes() == (finished / "tracks.csv").read_bytes()
+
+
+def test_a_gap_costs_its_own_minutes(tracked, finished, stream, tmp_path):
+    begin, end = START + 4000, START + 4600
+    (stream.slice(START, begin) + stream.slice(end)).write(str(tmp_path / "w.mseed"), "MSEED")
+    rows, whole = detections(tracked(tmp_path / "w.mseed")), detections(finished)
+    assert rows["time"].tolist() == whole["time"].tolist()
+    seconds = (pd.to_datetime(rows["time"]) - pd.Timestamp(str(START))).dt.total_seconds()
+    touched = seconds.between(4000 - 101, 4600 + 101)
+    inside = seconds.between(4000 + 80, 4600 - 80)
+    assert (rows.loc[inside, "coverage"] == 0).all()
+    assert rows.loc[inside, ["azimuth_llr", "range_llr"]].isna().all(axis=None)
+    assert (rows.loc[~inside, "coverage"] > 0).all()
+    before = seconds < 4000 - 101
+    pd.testing.assert_frame_equal(rows[before], whole[before])
+    np.testing.assert_array_equal(rows.loc[~touched, "coverage"], whole.loc[~touched, "coverage"])
+
+
+def test_no_horizontals_is_range_only(tracked, finished, inventory, tmp_path):
+    out = tracked(station=only(inventory, tmp_path / "s.xml", "BDH", "BHZ"))
+    rows = detections(out)
+    assert "range only" in notes(out)
+    assert rows[["azimuth_deg", "azimuth_llr"]].isna().all(axis=None)
+    np.testing.assert_array_equal(rows["range_m"], detections(finished)["range_m"])
+    assert pd.read_csv(out / "tracks.csv")["course_deg"].isna().all()
+
+
+def test_no_hydrophone_is_azimuth_by_polarisation(tracked, inventory, tmp_path):
+    out = tracked(station=only(inventory, tmp_path / "s.xml", "BH1", "BH2", "BHZ"))
+    rows = detections(out)
+    assert "ambiguous by 180°" in notes(out)
+    assert rows[["range_m", "range_llr"]].isna().all(axis=None)
+    near = (pd.to_datetime(rows["time"]) - pd.Timestamp(str(START + 3600), tz="UTC")).abs() < "5min"
+    off = (rows.loc[near, "azimuth_deg"] - 150 + 90) % 180 - 90
+    assert off.notna().all()
+    assert off.abs().max() < 30
+
+
+def test_no_response_is_said(tracked, inventory, tmp_path):
+    def bare(channel):
+        channel.response = None
+
+    station = only(inventory, tmp_path / "s.xml", "BDH", "BH1", "BH2", "BHZ", change=bare)
+    out = tracked(station=station)
+    assert "BDH has no response: its samples are taken as they are" in notes(out)
+
+
+def test_a_file_cut_short_serves_as_far_as_it_goes(tracked, record, tmp_path):
+    whole = (record / "waveforms.mseed").read_bytes()
+    (tmp_path / "cut.mseed").write_bytes(whole[: len(whole) // 2 + 777])
+    out = tracked(tmp_path / "cut.mseed")
+    assert "records are cut or unreadable" in notes(out)
+    assert len(detections(out))
+
+
+def test_times_with_an_offset_are_that_time(tracked, record):
+    span = ("--start", "2013-05-21T13:00:00+02:00", "--end", "2013-05-21T11:20:00")
+    times = detections(tracked(record / "waveforms.mseed", *span))["time"]
+    assert times.iloc[0] >= "2013-05-21T11:00:00Z"
+    assert times.iloc[-1] <= "2013-05-21T11:20:00Z"
+    assert len(times) >= 18
+
+
+def test_a_run_after_another_leaves_nothing_of_it(tracked, obsnet, record):
+    out = tracked(record / "waveforms.mseed", "--tracker", "bernoulli")
+    assert (out / "live.csv").exists()
+    status, _, _ = obsnet(
+        "detect", record / "waveforms.mseed", "--station", record / "station.xml", "--out", out, "--quiet"
+    )
+    assert status == 0
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def test_evaluate_reads_what_was_written(obsnet, record, finished):
+    status, told, errors = obsnet("evaluate", finished, "--ais", record / "ais.csv", "--json")
+    assert (status, errors) == (0, [])
+    (ship,) = json.loads(told[0])["ships"]
+    assert abs(ship["cpa_time_error_s"]) < 60
