@@ -61,7 +61,7 @@ def _statements(result: Result) -> list[str]:
     for name, settings in result.to_json().items():
         needed = [np.log(PLACES) / row["information_nats"] * SCAN_S for row in settings.values()]
         text.append(
-            f"{name}: to tell {PLACES} places in 5 km apart takes any filter about "
+            f"{name}: to tell {PLACES} places in 5 km apart takes about "
             f"{min(needed):.0f} to {max(needed):.0f} s of such scans."
         )
     return text
