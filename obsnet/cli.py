@@ -83,6 +83,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Entry point: run a command, turn expected errors into one line and exit status 2."""
     # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="replace")
     command = typer.main.get_command(app)
     with warnings.catch_warnings(), console.stoppable():
         if not sys.warnoptions:
