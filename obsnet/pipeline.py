@@ -110,7 +110,7 @@ class Pipeline:
         self._null: np.ndarray | None = None
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
-        self._follower = _follower(self.table) if config.tracker == "focalization" else None
+        self._follower = _follower(self.table, amplitudes) if config.tracker == "focalization" else None
         self._followed: list[StationScans] = []
         self._next: float | None = None
         self._last: float | None = None
@@ -214,10 +214,10 @@ class Pipeline:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
 
 
-def _follower(table: xr.Dataset) -> StationFocalization:
+def _follower(table: xr.Dataset, amplitudes: Amplitudes) -> StationFocalization:
     from obsnet.trackers.station_focalization import StationFocalization
 
-    return StationFocalization(table)
+    return StationFocalization(table, amplitudes=amplitudes)
 
 
 def _power(spectra: xr.Dataset) -> xr.DataArray:
