@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from typing import Any, TypeVar
@@ -58,7 +59,7 @@ def run(
     ConfigError
         `runs`, `seed` or `jobs` is out of range.
     Exception
-        What a trial raises; the runs that have not begun are cancelled.
+        What a trial raises; the other runs end there, as they do on an interruption.
     """
     if isinstance(jobs, bool) or not isinstance(jobs, (int, np.integer)) or jobs < 1:
         raise ConfigError(f"a Monte Carlo study needs at least 1 job, found {jobs!r}")
@@ -70,12 +71,21 @@ def run(
             if progress is not None:
                 progress(len(outcomes), runs)
         return outcomes
-    with ProcessPoolExecutor(min(jobs, runs), mp_context=multiprocessing.get_context("spawn")) as pool:
+    before = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(
+        min(jobs, runs),
+        multiprocessing.get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    ) as pool:
         futures = [pool.submit(_one, trial, sequence, tuple(arguments)) for sequence in sequences]
         try:
             _follow(futures, progress)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for worker in set(multiprocessing.active_children()) - before:
+                worker.terminate()
+                worker.join()
             raise
         return [future.result() for future in futures]
 

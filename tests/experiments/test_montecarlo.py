@@ -1,3 +1,6 @@
+import multiprocessing
+import time
+
 import numpy as np
 import pytest
 
@@ -37,6 +40,25 @@ def test_progress_counts_every_run_once(jobs):
 def test_a_failing_trial_fails_the_study(jobs):
     with pytest.raises(FilterError, match="all weights are zero"):
         montecarlo.run(die, runs=3, seed=0, jobs=jobs)
+
+
+def linger(rng):
+    time.sleep(120.0 if rng.random() > 0.5 else 0.0)
+
+
+def test_an_interruption_ends_the_runs_that_go_on():
+    seed = 1
+    quick = [np.random.default_rng(sequence).random() < 0.5 for sequence in montecarlo.seeds(2, seed)]
+    assert sorted(quick) == [False, True]
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        montecarlo.run(linger, runs=2, seed=seed, jobs=2, progress=interrupt)
+    assert time.monotonic() - begin < 60.0
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize(
