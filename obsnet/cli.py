@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")
     command = typer.main.get_command(app)
-    with warnings.catch_warnings(), console.stoppable():
+    with warnings.catch_warnings(), console.stoppable(), console.caching():
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
         try:

@@ -1,4 +1,5 @@
-"""What a command says and hears: lines on standard output, a progress bar, a wish that it stop.
+"""What a command says and hears: lines on standard output, a progress bar, a wish that it stop;
+and where its libraries keep their caches.
 
 Standard error is for errors alone.
 """
@@ -8,9 +9,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import NoReturn
 
 from obsnet.errors import OutputError
@@ -48,6 +51,27 @@ def _stop(number: int, frame: object = None) -> NoReturn:
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     sys.exit(128 + number)
+
+
+@contextmanager
+def caching() -> Iterator[None]:
+    """A place for the caches of numba and matplotlib where neither package nor home can be written.
+
+    It lasts as long as the command: a lasting one that others can write would hand them this process.
+    """
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    near = next((path for path in (home, *home.parents) if path.exists()), home)
+    if os.access(Path(__file__).parent, os.W_OK) or os.access(near, os.W_OK):
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="obsnet-") as folder:
+        places = {name: folder for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR") if name not in os.environ}
+        os.environ.update(places)
+        try:
+            yield
+        finally:
+            for name in places:
+                del os.environ[name]
 
 
 def say(text: str) -> None:
