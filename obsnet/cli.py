@@ -329,10 +329,12 @@ def _summary(run: Run, out: Path) -> None:
         console.say(f"note: {warning}")
     for number, track in enumerate(run.tracks, 1):
         row = track.row(number)
+        seen = row["course_deg"] == row["course_deg"]
+        course = f"azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± {row['course_std_deg']:.1f}°, "
         console.say(
-            f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at {row['cpa_distance_m'] / 1000:.2f} ± "
-            f"{row['cpa_distance_std_m'] / 1000:.2f} km, azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± "
-            f"{row['course_std_deg']:.1f}°, {row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
+            f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at "
+            f"{row['cpa_distance_m'] / 1000:.2f} ± {row['cpa_distance_std_m'] / 1000:.2f} km, {course if seen else ''}"
+            f"{row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
             f"log Bayes factor {row['log_bayes_factor']:.0f} ({track.method})"
         )
     if not run.tracks:
