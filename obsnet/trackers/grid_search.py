@@ -127,7 +127,8 @@ def search(
     for track in known:
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
     tracks: list[Track] = []
-    for number in range(config.max_ships):
+    # Without azimuths nothing tells a second ship from the first one's ghost ranges.
+    for number in range(config.max_ships if "azimuth_llr" in maps else 1):
         found = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
         least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
         if found is None or found.log_bayes_factor < least:

@@ -143,7 +143,7 @@ def test_range_alone_finds_the_passage_but_no_course():
     maps = maps_of([truth], MINUTES, np.random.default_rng(8)).drop_vars(
         ["azimuth_llr", "azimuth_coverage", "azimuth"]
     )
-    (found, *_) = search(maps, SEGMENT, delay)
+    (found,) = search(maps, SEGMENT, delay)
     assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
     assert abs(found.motion.cpa_range_m) == pytest.approx(10_000.0, abs=400.0)
     assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
