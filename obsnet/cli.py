@@ -11,18 +11,12 @@ import sys
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
-from obsnet import console
+from obsnet import commands, console
 from obsnet.errors import ConfigError, ObsnetError
-
-if TYPE_CHECKING:
-    from obsnet.calibration import Calibration
-    from obsnet.pipeline import RunConfig
-    from obsnet.run import Run
-    from obsnet.signals.station import Station
 
 app = typer.Typer(
     name="obsnet",
@@ -136,9 +130,9 @@ def demo(
     from obsnet.sample import sample_folder
 
     folder = sample_folder()
-    _track([str(folder / "waveforms.mseed")], folder / "station.xml", out, detector=detector, jobs=jobs, quiet=quiet,
+    commands.track([str(folder / "waveforms.mseed")], folder / "station.xml", out, detector=detector, jobs=jobs, quiet=quiet,
            ais=folder / "ais.csv")  # fmt: skip
-    _evaluate(out, folder / "ais.csv", quiet=quiet)
+    commands.evaluate(out, folder / "ais.csv", quiet=quiet)
 
 
 @app.command()
@@ -165,7 +159,7 @@ def track(
     quiet: Quiet = False,
 ) -> None:
     """Waveforms to maps, detections, tracks and a report."""
-    _track(
+    commands.track(
         waveforms, station, out, code=code, detector=detector, tracker=tracker, config=config, overrides=overrides,
         start=start, end=end, ais=ais, calibration=calibration, propagation=propagation, orientation=orientation,
         hydrophone_polarity=hydrophone_polarity, depth=depth, latitude=latitude, longitude=longitude, jobs=jobs, quiet=quiet,
@@ -195,7 +189,7 @@ def detect(
     quiet: Quiet = False,
 ) -> None:
     """Waveforms to maps and detections, without tracking."""
-    _track(
+    commands.track(
         waveforms, station, out, code=code, detector=detector, config=config, overrides=overrides, start=start, end=end,
         ais=ais, calibration=calibration, propagation=propagation, orientation=orientation,
         hydrophone_polarity=hydrophone_polarity, depth=depth, latitude=latitude, longitude=longitude, jobs=jobs, quiet=quiet,
@@ -210,136 +204,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the core paper's Table I for a run, against AIS."""
-    _evaluate(folder, ais, as_json=as_json)
-
-
-def _track(
-    waveforms: list[str],
-    station_file: Path,
-    out: Path,
-    *,
-    code: str | None = None,
-    detector: str | None = None,
-    tracker: str | None = None,
-    config: Path | None = None,
-    overrides: list[str] | None = None,
-    start: str | None = None,
-    end: str | None = None,
-    ais: Path | None = None,
-    calibration: Path | None = None,
-    propagation: Path | None = None,
-    orientation: float | None = None,
-    hydrophone_polarity: int | None = None,
-    depth: float | None = None,
-    latitude: float | None = None,
-    longitude: float | None = None,
-    jobs: int | None = None,
-    quiet: bool = False,
-    tracking: bool = True,
-) -> None:
-    import obsnet.run as runs
-    from obsnet.output import staged
-
-    settings = _run_config(config, overrides, detector, tracker)
-    station = _station(
-        station_file, code, start, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
-        latitude=latitude, longitude=longitude,
-    )  # fmt: skip
-    fitted = _calibration(calibration)
-    station = fitted.apply(station) if fitted else station
-    reference = _reference(ais, station) if ais else None
-    table = _table(propagation)
-    with staged(out, leftovers=("live.csv",)) as folder:
-        with console.progress("reading and detecting", quiet) as progress:
-            task = runs.track if tracking else runs.detect
-            run = task(
-                waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-                progress=progress, amplitudes=fitted.amplitudes if fitted else None, table=table,
-            )  # fmt: skip
-        runs.write_tables(run, folder)
-        run.plot(folder / "report.png", reference=reference)
-        console.heed()
-    if not quiet:
-        _summary(run, out)
-
-
-def _evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
-    from obsnet.evaluation import evaluate_folder
-
-    evaluation = evaluate_folder(folder, ais)
-    if as_json:
-        console.say(json.dumps(evaluation.to_json()))
-    elif not quiet:
-        console.say(evaluation.table())
-
-
-def _run_config(
-    path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None
-) -> RunConfig:
-    from obsnet.config import build, merge_overrides, read_yaml
-    from obsnet.pipeline import RunConfig
-
-    values = read_yaml(path) if path else {}
-    values = merge_overrides(values, overrides or [])
-    for key, value in (("detector", detector), ("tracker", tracker)):
-        if value is not None:
-            values[key] = value
-    return build(RunConfig, values)
-
-
-def _station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:
-    from obsnet.signals.station import Station
-
-    return Station.from_stationxml(
-        path, code, time=start, **{key: value for key, value in overrides.items() if value is not None}
-    )
-
-
-def _calibration(path: Path | None) -> Calibration | None:
-    if path is None:
-        return None
-    from obsnet.calibration import Calibration
-
-    return Calibration.read(path)
-
-
-def _table(path: Path | None) -> Any:
-    if path is None:
-        return None
-    from obsnet.ocean.rays import read_propagation
-
-    return read_propagation(path)
-
-
-def _reference(path: Path, station: Station) -> list:
-    from obsnet.ais import read, reference_tracks
-
-    return reference_tracks(read(path), station)
-
-
-def _summary(run: Run, out: Path) -> None:
-    found = run.detections
-    azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
-    console.say(
-        f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range"
-    )
-    for note in run.info.get("notes", []):
-        console.say(f"note: {note}")
-    for warning in run.info["waveforms"].get("warnings", []):
-        console.say(f"note: {warning}")
-    for number, track in enumerate(run.tracks, 1):
-        row = track.row(number)
-        seen = row["course_deg"] == row["course_deg"]
-        course = f"azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± {row['course_std_deg']:.1f}°, "
-        console.say(
-            f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at "
-            f"{row['cpa_distance_m'] / 1000:.2f} ± {row['cpa_distance_std_m'] / 1000:.2f} km, {course if seen else ''}"
-            f"{row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
-            f"log Bayes factor {row['log_bayes_factor']:.0f} ({track.method})"
-        )
-    if not run.tracks:
-        console.say("no ship found" if "track" in run.info["seconds"] else "detections only")
-    console.say(f"written to {out}")
+    commands.evaluate(folder, ais, as_json=as_json)
 
 
 @app.command()
@@ -360,9 +225,9 @@ def calibrate(
     from obsnet.calibration import calibrate_waveforms
     from obsnet.output import staged
 
-    settings = _run_config(config, overrides, None, None)
-    where = _station(station, code, start, depth_m=depth)
-    reference = _reference(ais, where)
+    settings = commands.run_config(config, overrides, None, None)
+    where = commands.read_station(station, code, start, depth_m=depth)
+    reference = commands.read_reference(ais, where)
     with staged(out) as folder:
         with console.progress("calibrating", quiet) as progress:
             result = calibrate_waveforms(waveforms, where, reference, settings, start, end, progress)

@@ -1,0 +1,151 @@
+"""What commands do once their arguments are read: files into parameters and a station, a whole run into a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from obsnet import console
+
+if TYPE_CHECKING:
+    from obsnet.calibration import Calibration
+    from obsnet.pipeline import RunConfig
+    from obsnet.run import Run
+    from obsnet.signals.station import Station
+
+
+def track(
+    waveforms: list[str],
+    station_file: Path,
+    out: Path,
+    *,
+    code: str | None = None,
+    detector: str | None = None,
+    tracker: str | None = None,
+    config: Path | None = None,
+    overrides: list[str] | None = None,
+    start: str | None = None,
+    end: str | None = None,
+    ais: Path | None = None,
+    calibration: Path | None = None,
+    propagation: Path | None = None,
+    orientation: float | None = None,
+    hydrophone_polarity: int | None = None,
+    depth: float | None = None,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    jobs: int | None = None,
+    quiet: bool = False,
+    tracking: bool = True,
+) -> None:
+    """Read waveforms, station and parameters; run; put the run's files into `out` and say what was found."""
+    import obsnet.run as runs
+    from obsnet.output import staged
+
+    settings = run_config(config, overrides, detector, tracker)
+    station = read_station(
+        station_file, code, start, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
+        latitude=latitude, longitude=longitude,
+    )  # fmt: skip
+    fitted = read_calibration(calibration)
+    station = fitted.apply(station) if fitted else station
+    reference = read_reference(ais, station) if ais else None
+    table = read_table(propagation)
+    with staged(out, leftovers=("live.csv",)) as folder:
+        with console.progress("reading and detecting", quiet) as progress:
+            task = runs.track if tracking else runs.detect
+            run = task(
+                waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
+                progress=progress, amplitudes=fitted.amplitudes if fitted else None, table=table,
+            )  # fmt: skip
+        runs.write_tables(run, folder)
+        run.plot(folder / "report.png", reference=reference)
+        console.heed()
+    if not quiet:
+        _summary(run, out)
+
+
+def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
+    """Say Table I of a run against AIS."""
+    from obsnet.evaluation import evaluate_folder
+
+    evaluation = evaluate_folder(folder, ais)
+    if as_json:
+        console.say(json.dumps(evaluation.to_json()))
+    elif not quiet:
+        console.say(evaluation.table())
+
+
+def run_config(
+    path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None
+) -> RunConfig:
+    """`RunConfig` of a YAML file, overrides of single parameters, and the choices made by options."""
+    from obsnet.config import build, merge_overrides, read_yaml
+    from obsnet.pipeline import RunConfig
+
+    values = read_yaml(path) if path else {}
+    values = merge_overrides(values, overrides or [])
+    for key, value in (("detector", detector), ("tracker", tracker)):
+        if value is not None:
+            values[key] = value
+    return build(RunConfig, values)
+
+
+def read_station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:
+    """The station of a StationXML; `overrides` as `Station.from_stationxml` takes them, None where not given."""
+    from obsnet.signals.station import Station
+
+    return Station.from_stationxml(
+        path, code, time=start, **{key: value for key, value in overrides.items() if value is not None}
+    )
+
+
+def read_calibration(path: Path | None) -> Calibration | None:
+    """The file of ``obsnet calibrate``, if one was given."""
+    if path is None:
+        return None
+    from obsnet.calibration import Calibration
+
+    return Calibration.read(path)
+
+
+def read_table(path: Path | None) -> Any:
+    """The propagation table of a file, if one was given."""
+    if path is None:
+        return None
+    from obsnet.ocean.rays import read_propagation
+
+    return read_propagation(path)
+
+
+def read_reference(path: Path, station: Station) -> list:
+    """Reference tracks of an AIS file, around the station."""
+    from obsnet.ais import read, reference_tracks
+
+    return reference_tracks(read(path), station)
+
+
+def _summary(run: Run, out: Path) -> None:
+    found = run.detections
+    azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
+    console.say(
+        f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range"
+    )
+    for note in run.info.get("notes", []):
+        console.say(f"note: {note}")
+    for warning in run.info["waveforms"].get("warnings", []):
+        console.say(f"note: {warning}")
+    for number, found_track in enumerate(run.tracks, 1):
+        row = found_track.row(number)
+        seen = row["course_deg"] == row["course_deg"]
+        course = f"azimuth {row['cpa_azimuth_deg']:.0f}°, course {row['course_deg']:.1f} ± {row['course_std_deg']:.1f}°, "
+        console.say(
+            f"track {number}: CPA {row['cpa_time']} ± {row['cpa_time_std_s']:.0f} s at "
+            f"{row['cpa_distance_m'] / 1000:.2f} ± {row['cpa_distance_std_m'] / 1000:.2f} km, {course if seen else ''}"
+            f"{row['speed_mps']:.2f} ± {row['speed_std_mps']:.2f} m/s, "
+            f"log Bayes factor {row['log_bayes_factor']:.0f} ({found_track.method})"
+        )
+    if not run.tracks:
+        console.say("no ship found" if "track" in run.info["seconds"] else "detections only")
+    console.say(f"written to {out}")
