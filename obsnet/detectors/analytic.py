@@ -363,19 +363,20 @@ def cepstral_model(
         raise ConfigError(f"no amplitude is known of the pairs {', '.join(config.pairs)}; known are {known}")
     range_m = config.range_m
     factor = 2.0 if config.pulse == "text" else 1.0
+    quefrency_s = np.asarray(quefrency_s, float)
     model = np.zeros((len(config.pairs), len(range_m), len(quefrency_s)))
     for p, pair in enumerate(config.pairs):
         if pair not in amplitudes.pairs:
             continue
-        delay = tdoa(propagation, pair).interp(range=range_m).values
+        delay = _interp(tdoa(propagation, pair), range_m)
         phase = _interp_phase(phase_difference(propagation, pair), range_m)
-        lag = np.asarray(quefrency_s)[None, :] - delay[:, None]
-        pulse = np.cos(2 * np.pi * config.centre_frequency_hz * lag + phase[:, None])
-        pulse *= np.exp(-(lag**2) / (factor * config.pulse_width_s**2))
-        pulse[np.abs(lag) > 4 * config.pulse_width_s] = 0.0
         amplitude = amplitudes.evaluate(pair, range_m)
-        amplitude[amplitude < UNHEARD] = 0.0
-        model[p] = np.nan_to_num(amplitude[:, None] * pulse)
+        amplitude[~(amplitude >= UNHEARD)] = 0.0
+        row, column = np.nonzero(np.abs(quefrency_s - delay[:, None]) <= 4 * config.pulse_width_s)
+        lag = quefrency_s[column] - delay[row]
+        pulse = np.cos(2 * np.pi * config.centre_frequency_hz * lag + phase[row])
+        pulse *= amplitude[row] * np.exp(-(lag**2) / (factor * config.pulse_width_s**2))
+        model[p][row, column] = np.nan_to_num(pulse)
     return model
 
 
@@ -426,10 +427,15 @@ def range_maps(
 _LLR = {"long_name": "natural log of the likelihood ratio, a ship here against no ship", "units": "1"}
 
 
+def _interp(values: xr.DataArray, range_m: np.ndarray) -> np.ndarray:
+    """Linear in range; NaN off the table."""
+    return np.interp(range_m, values["range"].values, values.values, left=np.nan, right=np.nan)
+
+
 def _interp_phase(phase_deg: xr.DataArray, range_m: np.ndarray) -> np.ndarray:
     """Phase [rad] at `range_m`, interpolated on the circle."""
     phasor = phase_deg.copy(data=np.exp(1j * np.deg2rad(phase_deg.values)))
-    return np.angle(phasor.interp(range=range_m).values)
+    return np.angle(_interp(phasor, range_m))
 
 
 def _gaussian(std_bins: float) -> np.ndarray:

@@ -88,14 +88,15 @@ def range_presence(
     The prior is proportional to range and uniform in range rate (paper's eqs 20, 22); for a closing or an opening ship it is
     the same over half of the range rates (eq. 25).
     """
-    top = np.max(range_llr, axis=(1, 2), keepdims=True)
-    top = np.where(np.isfinite(top), top, np.float32(0.0))
-    raised = np.exp(range_llr - top)
     prior = (np.maximum(range_m, 0.0) / np.maximum(range_m, 0.0).sum()).astype(np.float32)
-    per_rate = np.einsum("trv,r->tv", raised, prior)
+    top = np.max(range_llr, axis=(1, 2))
+    top = np.where(np.isfinite(top), top, np.float32(0.0))
+    raised = range_llr - top[:, None, None]
+    np.exp(raised, out=raised)
+    per_rate = np.matmul(prior, raised)
     with np.errstate(divide="ignore"):
         return {
-            name: np.log(per_rate[:, chosen].mean(axis=1)) + top[:, 0, 0]
+            name: np.log(per_rate[:, chosen].mean(axis=1)) + top
             for name, chosen in (
                 ("range", slice(None)),
                 ("approaching", range_rate <= 0),

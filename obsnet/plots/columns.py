@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import h5py
 import numpy as np
 import xarray as xr
 
+from obsnet import netcdf
 from obsnet.detectors.maps import range_rate_marginal
 from obsnet.layout import to_posix
 
@@ -116,41 +115,10 @@ def range_columns(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.
     shown = np.flatnonzero(chosen >= 0)
     out = np.full((columns.count, llr.sizes["range"]), np.nan, np.float32)
     at_once = max(1, _CELLS_AT_ONCE // (llr.sizes["range"] * llr.sizes["range_rate"]))
-    with _reader(llr) as minutes:
-        for begin in range(0, len(shown), at_once):
-            part = shown[begin : begin + at_once]
-            out[part] = range_rate_marginal(minutes(chosen[part]))
+    for begin in range(0, len(shown), at_once):
+        part = shown[begin : begin + at_once]
+        out[part] = range_rate_marginal(netcdf.rows(llr, chosen[part]))
     return out
-
-
-@contextmanager
-def _reader(llr: xr.DataArray) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """Function that gives a map's minutes at increasing rows, float32.
-
-    A map that lies packed on disk is read past xarray, which takes ten times as long.
-    """
-    known = llr.encoding
-    if known.get("source") and known.get("scale_factor") and "_FillValue" in known:
-        with h5py.File(known["source"], "r") as file:
-            stored = file[llr.name]
-            if stored.shape == llr.shape:
-                yield lambda rows: _unpacked(_rows(stored, rows), known["scale_factor"], known["_FillValue"])
-                return
-    yield lambda rows: llr.isel(time=rows).values.astype(np.float32, copy=False)
-
-
-def _rows(stored: Any, rows: np.ndarray) -> np.ndarray:
-    """Rows of an array on disk: near ones in one go, far ones each by itself."""
-    if rows[-1] - rows[0] < 4 * len(rows):
-        return stored[rows[0] : rows[-1] + 1][rows - rows[0]]
-    return np.stack([stored[row] for row in rows])
-
-
-def _unpacked(values: np.ndarray, scale: float, fill: int) -> np.ndarray:
-    missing = values[:, 0, 0] == fill
-    made = values * np.float32(scale)
-    made[missing] = np.nan
-    return made
 
 
 def _slices(count: int) -> Iterator[slice]:

@@ -103,6 +103,7 @@ class ClutterFilter:
     def __init__(self, config: CepstrogramConfig = CepstrogramConfig()) -> None:
         self.config = config
         self._steps: dict[int, _Step] = {}
+        self._held = _Step(0, np.zeros(()))
         self._learned: np.ndarray | None = None
         self._learned_step: int | None = None
         self._early = _Step(0, np.zeros(()))
@@ -127,32 +128,29 @@ class ClutterFilter:
 
     def _is_due(self, step: int) -> bool:
         if self._learned is None:
-            return sum(held.count for held in self._steps.values()) >= self.WARM_UP_FRAMES
+            return self._held.count >= self.WARM_UP_FRAMES
         return step != self._learned_step
 
     def _next_instant(self, steps: np.ndarray, values: np.ndarray, done: int) -> int:
         """First frame after `done` before which the filter must look whether to learn anew."""
         end = int(np.searchsorted(steps, steps[done], side="right"))
         if self._learned is None:
-            held = sum(held.count for held in self._steps.values())
-            valid = np.cumsum(~np.isnan(values[done:end, 0])) + held
+            valid = np.cumsum(~np.isnan(values[done:end, 0])) + self._held.count
             end = min(end, done + 1 + int(np.searchsorted(valid, self.WARM_UP_FRAMES)))
         return max(end, done + 1)
 
     def _learn(self, step: int) -> None:
         oldest = step - round(self.config.clutter_window_s / self.config.clutter_step_s)
-        self._steps = {key: held for key, held in self._steps.items() if key >= oldest}
-        count = sum(held.count for held in self._steps.values())
+        for key in [key for key in self._steps if key < oldest]:
+            self._held = self._held - self._steps.pop(key)
+        count = self._held.count
         self._learned_step = step
         if count < self.WARM_UP_FRAMES:
             self._learned, self._early = None, _Step(0, np.zeros(()))
         elif self.config.clutter == "svd":
-            self._learned = leading_basis(self._moment(), count)
+            self._learned = leading_basis(self._held.moment, count)
         else:
-            self._learned = self._moment() / count
-
-    def _moment(self) -> np.ndarray:
-        return np.sum([held.moment for held in self._steps.values()], axis=0)
+            self._learned = self._held.moment / count
 
     def _project(self, frames: np.ndarray) -> np.ndarray:
         learned = self._learned
@@ -179,8 +177,10 @@ class ClutterFilter:
         if not len(valid):  # a dead hydrophone shall not fill the memory with Gram matrices of nothing
             return
         moment = valid.T @ valid if self.config.clutter == "svd" else valid.sum(axis=0)
+        new = _Step(len(valid), moment)
         held = self._steps.get(step)
-        self._steps[step] = _Step(len(valid), moment) if held is None else held + _Step(len(valid), moment)
+        self._steps[step] = new if held is None else held + new
+        self._held = self._held + new
 
 
 @dataclass(frozen=True)
@@ -192,6 +192,9 @@ class _Step:
 
     def __add__(self, other: _Step) -> _Step:
         return _Step(self.count + other.count, self.moment + other.moment)
+
+    def __sub__(self, other: _Step) -> _Step:
+        return _Step(self.count - other.count, self.moment - other.moment)
 
 
 def leading_basis(gram: np.ndarray, count: int, guess: int = 32) -> np.ndarray:
@@ -221,9 +224,11 @@ def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.n
     if 2 * size >= len(matrix):
         values, vectors = scipy.linalg.eigh(matrix, check_finite=False)
         return values[::-1][:size], vectors[:, ::-1][:, :size]
-    basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8))
+    single = matrix.astype(np.float32)
+    basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8), np.float32)
     for _ in range(5):
-        basis, _ = np.linalg.qr(matrix @ (matrix @ basis))
+        basis, _ = np.linalg.qr(single @ (single @ basis))
+    basis = basis.astype(matrix.dtype)
     values, turn = scipy.linalg.eigh(basis.T @ matrix @ basis, check_finite=False)
     return values[::-1][:size], (basis @ turn)[:, ::-1][:, :size]
 

@@ -18,6 +18,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import gammaln
 
+from obsnet import netcdf
 from obsnet.errors import ConfigError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import to_posix
@@ -422,12 +423,9 @@ def _tiles(
     chosen = np.flatnonzero(inside)
     if len(chosen) < 3:
         return None
-    strides = np.diff(chosen)
-    regular = slice(chosen[0], chosen[-1] + 1, strides[0]) if (strides == strides[0]).all() else chosen
-    part = maps.isel(time=regular)
 
     def llr(name: str) -> np.ndarray | None:
-        return part[name].values.astype(np.float32, copy=False) if name in maps else None
+        return netcdf.rows(maps[name], chosen) if name in maps else None
 
     return times[chosen], llr("azimuth_llr"), llr("range_llr")
 
