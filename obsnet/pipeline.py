@@ -6,8 +6,10 @@ were cut into blocks, and its memory does not grow with the record.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import pandas as pd
@@ -153,6 +155,53 @@ class Pipeline:
         names = ("range_mode_m", "mode_probability", "range_mean_m", "range_std_m", "range_rate_mps")
         return pd.DataFrame(table | {name: joined(name) for name in (*names, "range_rate_std_mps")})
 
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next minute depends on, for a station that must survive; arrays by name, none changed in place.
+
+        A stage with a memory offers its own under its name. An array that is the same object as in an earlier state
+        is the same value.
+
+        Raises
+        ------
+        ConfigError : the focalization tracker is part of the run; its memory is not offered.
+        """
+        if self._follower is not None:
+            raise ConfigError(
+                "the focalization tracker cannot be stopped and continued; use --tracker grid for a live station"
+            )
+        arrays = {"next": np.array(self._next, float), "last": np.array(self._last, float)}
+        for name, stage in self._stages().items():
+            arrays |= {f"{name}/{key}": value for key, value in stage.state().items()}
+        for name, held in self._held().items():
+            if held is not None:
+                arrays |= {f"{name}/{key}": value for key, value in _laid_out(held).items()}
+        if self._null is not None:
+            arrays["null"] = self._null
+        return arrays
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on where `state` was taken, by a pipeline of the same station and configuration."""
+        self._next, self._last = (
+            None if np.isnan(state[name]) else float(state[name]) for name in ("next", "last")
+        )
+        for name, stage in self._stages().items():
+            stage.restore(_under(state, name))
+        self._azigram, self._cepstrogram, self._spectrogram = (
+            _taken_up(_under(state, name)) for name in self._held()
+        )
+        self._null = state.get("null")
+
+    def _stages(self) -> dict[str, Any]:
+        """The stages that remember something between blocks."""
+        return {"clutter": self._clutter, "background": self._background}
+
+    def _held(self) -> dict[str, xr.DataArray | None]:
+        return {
+            "azigram": self._azigram,
+            "cepstrogram": self._cepstrogram,
+            "spectrogram": self._spectrogram,
+        }
+
     def _take(self, spectra: xr.Dataset) -> None:
         if "east" in spectra and "north" in spectra:
             azimuths = azigram(spectra, self.config.azigram)
@@ -212,6 +261,29 @@ class Pipeline:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+
+
+def _laid_out(frames: xr.DataArray) -> dict[str, np.ndarray]:
+    """Frames as plain arrays: values, time, the other coordinate, and name, dims and attributes in JSON."""
+    said = json.dumps({"name": frames.name, "dims": frames.dims, "attrs": frames.attrs})
+    return {
+        "values": frames.values,
+        "time": frames["time"].values.astype(np.int64),
+        "axis": frames[frames.dims[0]].values,
+        "said": np.frombuffer(said.encode(), np.uint8),
+    }
+
+
+def _taken_up(arrays: Mapping[str, np.ndarray]) -> xr.DataArray | None:
+    if not arrays:
+        return None
+    said = json.loads(arrays["said"].tobytes())
+    coords = {said["dims"][0]: arrays["axis"], "time": arrays["time"].astype("datetime64[ns]")}
+    return xr.DataArray(arrays["values"], coords, said["dims"], said["name"], said["attrs"])
+
+
+def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
 def _follower(table: xr.Dataset, amplitudes: Amplitudes) -> StationFocalization:

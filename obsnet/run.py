@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 Progress = Callable[[float, float], None]
 """Called with seconds of record done and in all."""
 
+NEIGHBOUR_S = 3600.0
+"""A track that ended no longer than this before a segment may explain what is heard in it."""
+
 
 @dataclass
 class Run:
@@ -222,14 +225,21 @@ def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]
     )
     tracks: list[Track] = []
     for segment in found:
-        near = [known for known in tracks if known.end > segment.start - 3600.0]
-        new = search(run.maps, segment, delay, run.config.grid_search, threads, near)
-        if not new and not near and not _range_heard(run, segment):
-            new = _by_bearings(run, segment, delay)
-        if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
-            new = [replace(track, method=f"{track.method}; course ambiguous by 180°") for track in new]
-        tracks += new
+        near = [known for known in tracks if known.end > segment.start - NEIGHBOUR_S]
+        tracks += segment_tracks(run, segment, delay, near, threads)
     return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
+
+
+def segment_tracks(
+    run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray], near: list[Track], threads: int = 1
+) -> list[Track]:
+    """Tracks of one segment, given those found up to `NEIGHBOUR_S` before it; strongest first."""
+    new = search(run.maps, segment, delay, run.config.grid_search, threads, near)
+    if not new and not near and not _range_heard(run, segment):
+        new = _by_bearings(run, segment, delay)
+    if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
+        new = [replace(track, method=f"{track.method}; course ambiguous by 180°") for track in new]
+    return new
 
 
 def _followed(run: Run) -> list[Segment]:

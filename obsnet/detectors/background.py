@@ -6,6 +6,8 @@ azimuth detector asks whether a cell points to a ship rather than whether it poi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
 from scipy.ndimage import uniform_filter1d
@@ -40,6 +42,16 @@ class BackgroundDirection:
             background[:, lo:hi] = self._mean_before(step, values.shape[0], smooth_bins)[:, None]
             self._remember(step, values[:, lo:hi])
         return background
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next frame depends on, as arrays that are never changed in place."""
+        counts = np.array(list(self._counts.items()), np.int64).reshape(-1, 2)
+        return {"counts": counts} | {f"sum/{step}": total for step, total in self._sums.items()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on where `state` was taken."""
+        self._counts = {int(step): int(count) for step, count in state["counts"]}
+        self._sums = {step: state[f"sum/{step}"] for step in self._counts}
 
     def _smooth_bins(self, frequency: np.ndarray) -> int:
         if len(frequency) < 2:

@@ -7,6 +7,7 @@ file begins, so that a live station and a batch run agree.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -125,6 +126,26 @@ class ClutterFilter:
             self._remember(step, values[done:end])
             done = end
         return cepstra.copy(data=np.ascontiguousarray(filtered.T))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next frame depends on, as arrays that are never changed in place."""
+        counts = [(step, held.count) for step, held in self._steps.items()]
+        arrays = {f"moment/{step}": held.moment for step, held in self._steps.items()}
+        arrays["counts"] = np.array(counts, np.int64).reshape(-1, 2)
+        arrays["early"], arrays["early_count"] = self._early.moment, np.array(self._early.count)
+        if self._learned is not None:
+            arrays["learned"] = self._learned
+        if self._learned_step is not None:
+            arrays["learned_step"] = np.array(self._learned_step)
+        return arrays
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on where `state` was taken."""
+        counts = {int(step): int(count) for step, count in state["counts"]}
+        self._steps = {step: _Step(count, state[f"moment/{step}"]) for step, count in counts.items()}
+        self._early = _Step(int(state["early_count"]), state["early"])
+        self._learned = state.get("learned")
+        self._learned_step = int(state["learned_step"]) if "learned_step" in state else None
 
     def _is_due(self, step: int) -> bool:
         if self._learned is None:

@@ -84,9 +84,9 @@ class RecordReader:
             return None
         made = []
         for number, channel in enumerate(file.channels):
-            for first, last in _stretches(channel.table):
+            for first, last in stretches(channel.table):
                 read = partial(self._read, path, number, first)
-                made.append((channel.seed_id, _piece(channel, first, last, read)))
+                made.append((channel.seed_id, piece_of(channel, first, last, read)))
         return made, file
 
     def _read(self, path: Path, number: int, record: int, first: int, last: int) -> np.ndarray:
@@ -175,7 +175,7 @@ def _channel(table: np.ndarray) -> ChannelRecords:
     return ChannelRecords(f"{network}.{station}.{location}.{channel}", kept, before, int(same.sum()))
 
 
-def _stretches(table: np.ndarray) -> list[tuple[int, int]]:
+def stretches(table: np.ndarray) -> list[tuple[int, int]]:
     """Ranges of records that follow each other within half a sample, at one rate."""
     ends = table["start_ns"] + np.rint(table["count"] / table["rate"] * _SECOND).astype(np.int64)
     late = np.abs(table["start_ns"][1:] - ends[:-1]) / _SECOND * table["rate"][1:]
@@ -184,7 +184,7 @@ def _stretches(table: np.ndarray) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
-def _piece(channel: ChannelRecords, first: int, last: int, read: partial[np.ndarray]) -> Piece:
+def piece_of(channel: ChannelRecords, first: int, last: int, read: partial[np.ndarray]) -> Piece:
     """A stretch with its clock: the header's rate, the rate its records keep, or the records' own times."""
     table = channel.table[first:last]
     index = (channel.before[first:last] - channel.before[first]).astype(float)

@@ -152,7 +152,7 @@ def iter_spectra(source: WaveformSource, config: SpectraConfig = SpectraConfig()
         but a silence of over ten days, such as a clock that starts in 1980 makes, is passed over and noted.
     """
     spans = _spans(source, config)
-    builder = _Builder(source, config, spans[0][0], spans[-1][1])
+    builder = SpectraBuilder(source, config, spans[0][0], spans[-1][1])
     step = max(round(config.block_s / config.hop_s), 1)
     for first, last in spans:
         for begin in range(first, last, step):
@@ -182,7 +182,7 @@ def _spans(source: WaveformSource, config: SpectraConfig) -> list[tuple[int, int
     return spans
 
 
-class _Builder:
+class SpectraBuilder:
     """Makes the Dataset of a range of frames from the channels that serve at their times."""
 
     def __init__(self, source: WaveformSource, config: SpectraConfig, first: int, last: int) -> None:

@@ -265,7 +265,7 @@ def _sort(
     known = {channel.seed_id for channel in station.epochs}
     pieces: dict[str, list[Piece]] = {}
     for seed_id, piece in found:
-        own = _match(seed_id, known)
+        own = match_channel(seed_id, known)
         if own is None:
             report.left_aside[seed_id] = f"not described for {station.code}"
         elif not _EARLIEST_NS < piece.start_ns < _LATEST_NS:
@@ -279,7 +279,7 @@ def _sort(
     return {seed_id: Timeline(pieces[seed_id]) for seed_id in sorted(pieces)}
 
 
-def _match(seed_id: str, known: set[str]) -> str | None:
+def match_channel(seed_id: str, known: set[str]) -> str | None:
     """The station's channel that `seed_id` stands for, forgiving a location code or an empty network code."""
     if seed_id in known:
         return seed_id

@@ -43,7 +43,9 @@ def mixture(log_ratio: np.ndarray, probability: float) -> np.ndarray:
     return np.where(np.isnan(log_ratio), 0.0, mixed)
 
 
-def segments(presence: pd.DataFrame, config: SegmentationConfig = SegmentationConfig()) -> list[Segment]:
+def segments(
+    presence: pd.DataFrame, config: SegmentationConfig = SegmentationConfig(), ended: bool = True
+) -> list[Segment]:
     """Stretches of time in which one ship is heard.
 
     Parameters
@@ -51,6 +53,8 @@ def segments(presence: pd.DataFrame, config: SegmentationConfig = SegmentationCo
     presence : DataFrame indexed by s since 1970 (regular), with log presence ratios `azimuth`, `range`, and those of the range
         detector for closing and opening range rates alone, `approaching` and `leaving`; NaN where there is no data. Columns
         of a detector that is not there are missing or all NaN.
+    config : SegmentationConfig
+    ended : whether the record ends here. If it goes on, only the segments that no later minute can change.
 
     Returns
     -------
@@ -74,9 +78,11 @@ def segments(presence: pd.DataFrame, config: SegmentationConfig = SegmentationCo
     radial = heard & (smooth["range"] > 0)
     phase = np.where(radial & (smooth["approaching"] > smooth["leaving"]), -1, 0)
     phase = np.where(radial & (smooth["approaching"] < smooth["leaving"]), 1, phase)
+    settled = len(time) if ended else max(len(time) - wide // 2, 0)
     found: list[Segment] = []
-    for lo, hi in _runs(heard):
-        found += _split(time, phase, lo, hi)
+    for lo, hi in _runs(heard[:settled]):
+        pieces = _split(time, phase, lo, hi)
+        found += pieces[:-1] if hi == settled and not ended else pieces
     return [segment for segment in found if segment.end - segment.start >= config.shortest_min * 60.0]
 
 

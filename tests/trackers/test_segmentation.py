@@ -35,6 +35,24 @@ def test_one_ship_is_one_segment_with_its_cpa():
     assert segment.cpa == pytest.approx(T0 + 60 * 600, abs=60 * 10)
 
 
+def test_a_segment_is_said_while_the_record_goes_on_once_nothing_can_change_it():
+    ships = [(100, 250, 380), (380, 520, 640), (900, 1000, 1100)]
+    table = presence(ships=ships)
+    whole = segments(table)
+    assert len(whole) == 3
+    said = []
+    for minute in range(2, len(table), 3):
+        now = segments(table.iloc[:minute], ended=False)
+        assert now == whole[: len(now)]
+        said += now[len(said) :]
+        if said[1:2]:  # what lies hours before the segments to come no longer matters
+            late = table.iloc[max(minute - 500, 0) : minute]
+            assert [s for s in segments(late, ended=False) if s.start > late.index[0] + 3 * 3600] == [
+                s for s in now if s.start > late.index[0] + 3 * 3600
+            ]
+    assert said == whole
+
+
 def test_departure_before_an_approach_splits():
     first, second = segments(presence(ships=[(200, 350, 500), (500, 650, 800)]))
     assert first.end == second.start == pytest.approx(T0 + 60 * 500, abs=60 * 20)
