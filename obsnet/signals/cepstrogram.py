@@ -132,6 +132,7 @@ class ClutterFilter:
         counts = [(step, held.count) for step, held in self._steps.items()]
         arrays = {f"moment/{step}": held.moment for step, held in self._steps.items()}
         arrays["counts"] = np.array(counts, np.int64).reshape(-1, 2)
+        arrays["held"], arrays["held_count"] = self._held.moment, np.array(self._held.count)
         arrays["early"], arrays["early_count"] = self._early.moment, np.array(self._early.count)
         if self._learned is not None:
             arrays["learned"] = self._learned
@@ -143,6 +144,7 @@ class ClutterFilter:
         """Go on where `state` was taken."""
         counts = {int(step): int(count) for step, count in state["counts"]}
         self._steps = {step: _Step(count, state[f"moment/{step}"]) for step, count in counts.items()}
+        self._held = _Step(int(state["held_count"]), state["held"])
         self._early = _Step(int(state["early_count"]), state["early"])
         self._learned = state.get("learned")
         self._learned_step = int(state["learned_step"]) if "learned_step" in state else None
