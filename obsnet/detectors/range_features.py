@@ -117,14 +117,23 @@ class DelayTable:
         self.phase = np.where(np.isfinite(phase), phase, 1.0).astype(np.complex64)
         self.index = np.where(exists, np.rint(np.nan_to_num(seconds) / quefrency_step_s), n_quefrency)
         self.index = self.index.astype(np.int32)
-        self.seconds = np.where(exists, seconds, 0.0)
+        self.seconds = np.where(exists, seconds, 1.0)
         self.slope = np.where(exists, np.nan_to_num(np.gradient(seconds, FINE_M, axis=1)), 0.0)
         self.inverse = _inverse(seconds, exists, fine, config, quefrency_step_s, n_quefrency)
 
 
 @dataclass(frozen=True)
-class Window:
-    """Frames of a stretch of record as the kernels take them, and the windows that they fall into."""
+class Look:
+    """A stretch of record as the kernels take it, the windows that its frames fall into, and a first look at them.
+
+    Attributes
+    ----------
+    analytic : complex64 (frame, quefrency), of `analytic_cepstrum`. valid : bool (frame). frame_time : s since 1970.
+    minutes : s since 1970. start, stop : frames of each minute's window.
+    energy : float32 (minute, pair, rate, range), of each pair at every hypothesis of the grid; mean 1 in noise.
+    score : float32 (minute, rate, range), the cheap score of every hypothesis of the grid, ≥ 0.
+    once : float32 (minute, n), `GLOBALS` without the first.
+    """
 
     analytic: np.ndarray
     valid: np.ndarray
@@ -132,6 +141,9 @@ class Window:
     start: np.ndarray
     stop: np.ndarray
     minutes: np.ndarray
+    energy: np.ndarray
+    score: np.ndarray
+    once: np.ndarray
 
 
 class RangeFeatures:
@@ -150,8 +162,8 @@ class RangeFeatures:
         self._table: DelayTable | None = None
         self._lag_step = 0
 
-    def window(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> Window:
-        """Make the analytic cepstra of a stretch of record.
+    def look(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> Look:
+        """Take a first look at a stretch of record: the energy of every hypothesis of the grid.
 
         Parameters
         ----------
@@ -159,16 +171,26 @@ class RangeFeatures:
         minutes : centres of the windows, s since 1970.
         """
         require(cepstrogram, CEPSTROGRAM)
-        quefrency = cepstrogram["quefrency"].values
+        config, quefrency = self.config, cepstrogram["quefrency"].values
         nfft = int(cepstrogram.attrs.get("nfft", 2 * (quefrency.size - 1)))
-        if not np.array_equal(quefrency, self._quefrency):
+        if self._table is None or not np.array_equal(quefrency, self._quefrency):
             self._prepare(quefrency)
+        table, minutes = self.table, np.asarray(minutes, float)
         times = to_posix(cepstrogram["time"].values)
         frames = np.ascontiguousarray(cepstrogram.values.T)
         valid = ~np.isnan(frames[:, 0])
-        values = analytic_cepstrum(frames, quefrency, nfft, self.config.band_hz)
-        start, stop = window_bounds(times, minutes, self.config.window_s)
-        return Window(values, valid, times, start, stop, np.asarray(minutes, float))
+        analytic = analytic_cepstrum(frames, quefrency, nfft, config.band_hz)
+        start, stop = window_bounds(times, minutes, config.window_s)
+        shape = (len(minutes), len(config.pairs), len(config.range_rate), len(config.range_m))
+        energy = np.empty(shape, np.float32)
+        kernels.pair_energy(
+            analytic, valid, times, start, stop, minutes, table.index, table.pad, FINE_M,
+            round(config.range_step_m / FINE_M), config.range_rate, energy,
+        )  # fmt: skip
+        score = np.empty((shape[0], *shape[2:]), np.float32)
+        kernels.cheap_score(energy, score)
+        once = _once(analytic, valid, times, start, stop, minutes, energy, config)
+        return Look(analytic, valid, times, start, stop, minutes, energy, score, once)
 
     def _prepare(self, quefrency: np.ndarray) -> None:
         step = float(quefrency[-1] / (quefrency.size - 1) / OVERSAMPLING)
@@ -181,41 +203,15 @@ class RangeFeatures:
     def table(self) -> DelayTable:
         """Delays on the fine grid, once a window was made."""
         if self._table is None:
-            raise ConfigError("make a window first: the delay table follows its quefrencies")
+            raise ConfigError("take a look first: the delay table follows its quefrencies")
         return self._table
 
-    def energies(self, window: Window) -> np.ndarray:
-        """Energy of every pair at every hypothesis of the grid: (n_windows, n_pairs, n_rates, n_range) float32."""
-        config, table = self.config, self.table
-        shape = (len(window.minutes), len(config.pairs), len(config.range_rate), len(config.range_m))
-        energy = np.empty(shape, np.float32)
-        kernels.pair_energy(
-            window.analytic, window.valid, window.frame_time, window.start, window.stop, window.minutes,
-            table.index, table.pad, FINE_M, round(config.range_step_m / FINE_M), config.range_rate, energy,
-        )  # fmt: skip
-        return energy
-
-    def scores(self, energy: np.ndarray) -> np.ndarray:
-        """Cheap score of every hypothesis of the grid, (n_windows, n_rates, n_range) float32, ≥ 0."""
-        score = np.empty((energy.shape[0], *energy.shape[2:]), np.float32)
-        kernels.cheap_score(energy, score)
-        return score
-
-    def features(
-        self,
-        window: Window,
-        energy: np.ndarray,
-        score: np.ndarray,
-        index: np.ndarray,
-        range_m: np.ndarray,
-        rate: np.ndarray,
-    ) -> np.ndarray:
+    def features(self, look: Look, index: np.ndarray, range_m: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Feature vectors of hypotheses.
 
         Parameters
         ----------
-        window, energy, score : of the same minutes.
-        index : (n) which minute each hypothesis belongs to. range_m, rate : (n) hypotheses, m and m/s.
+        index : (n) which minute of the look each hypothesis belongs to. range_m, rate : (n) hypotheses, m and m/s.
 
         Returns
         -------
@@ -223,54 +219,40 @@ class RangeFeatures:
         `GLOBALS`.
         """
         config, table = self.config, self.table
-        count, (n_pairs, n_sub, _, _) = len(range_m), config.patch_shape
-        patch = np.empty((count, *config.patch_shape), np.float32)
-        heard, ghost = np.empty((count, n_pairs), np.float32), np.empty((count, n_pairs), np.float32)
-        index = np.ascontiguousarray(index, np.int64)
-        range_m, rate = np.ascontiguousarray(range_m, float), np.ascontiguousarray(rate, float)
-        kernels.gather(
-            window.analytic, window.valid, window.frame_time, window.start, window.stop, window.minutes, index,
-            range_m, rate, table.index, table.phase, table.pad, FINE_M, self._lag_step,
-            config.window_s / n_sub, patch, heard,
+        found = np.empty((len(range_m), config.size), np.float32)
+        kernels.describe(
+            look.analytic, look.valid, look.frame_time, look.start, look.stop, look.minutes, look.energy, look.score,
+            look.once, np.ascontiguousarray(index, np.int64), np.ascontiguousarray(range_m, float),
+            np.ascontiguousarray(rate, float), table.index, table.seconds, table.slope, table.phase, table.inverse,
+            table.pad, FINE_M, config.range_step_m, config.range_rate, self._lag_step,
+            config.window_s / config.sub_windows, config.sub_windows, config.lags, table.depth_m, found,
         )  # fmt: skip
-        kernels.ghosts(
-            energy, score, index, range_m, rate, table.index, table.slope, table.inverse, table.pad, FINE_M,
-            config.range_step_m, config.range_rate, ghost,
-        )  # fmt: skip
-        at = table.pad + np.rint(range_m / FINE_M).astype(int)
-        context = np.empty((count, n_pairs, len(CONTEXT)), np.float32)
-        context[..., 0] = (table.index[:, at] < window.analytic.shape[1] - 1).T
-        context[..., 1] = np.log1p(heard)
-        context[..., 2] = np.log1p(ghost)
-        context[..., 3] = 1e4 * table.slope[:, at].T
-        context[..., 4] = np.log(np.maximum(table.seconds[:, at].T, config.shortest_delay_s))
-        context[..., 5] = np.abs(context[..., 3] * rate[:, None] / 10.0)
-        context *= context[..., :1]
-        named = np.concatenate(
-            [(range_m / table.depth_m)[:, None], self._minute_globals(window, energy)[index]], axis=1
-        )
-        return np.concatenate(
-            [patch.reshape(count, -1), context.reshape(count, -1), named.astype(np.float32)], axis=1
-        )
+        return found
 
-    def _minute_globals(self, window: Window, energy: np.ndarray) -> np.ndarray:
-        n_sub = self.config.sub_windows
-        hop = float(np.median(np.diff(window.frame_time))) if window.frame_time.size > 1 else 1.0
-        expected = self.config.window_s / n_sub / hop
-        power = np.abs(window.analytic[:, :-1:OVERSAMPLING]) ** 2
-        power = np.where(window.valid, power[:, round(power.shape[1] * 0.03) :].mean(axis=1), 0.0)
-        out = np.zeros((len(window.minutes), n_sub + 2), np.float32)
-        for w, (lo, hi) in enumerate(zip(window.start, window.stop, strict=True)):
-            later = window.frame_time[lo:hi] - window.minutes[w]
-            sub = np.clip(
-                np.floor(later / (self.config.window_s / n_sub) + 0.5 * n_sub).astype(int), 0, n_sub - 1
-            )
-            out[w, :n_sub] = np.minimum(np.bincount(sub, window.valid[lo:hi], n_sub) / expected, 1.0)
-            count = window.valid[lo:hi].sum()
-            out[w, n_sub] = np.log(max(power[lo:hi].sum() / max(count, 1), 1e-3))
-        still = energy[:, :, energy.shape[2] // 2]
-        out[:, n_sub + 1] = np.log(np.maximum(still.mean(axis=(1, 2)), 1e-3))
-        return out
+
+def _once(
+    analytic: np.ndarray,
+    valid: np.ndarray,
+    times: np.ndarray,
+    start: np.ndarray,
+    stop: np.ndarray,
+    minutes: np.ndarray,
+    energy: np.ndarray,
+    config: RangeFeaturesConfig,
+) -> np.ndarray:
+    """Of each minute: coverage of its sub-windows, log power of its frames, log mean energy at range rate 0."""
+    n_sub, length = config.sub_windows, config.window_s / config.sub_windows
+    hop = float(np.median(np.diff(times))) if times.size > 1 else 1.0
+    thinned = analytic[:, round(0.03 * analytic.shape[1]) : -1 : OVERSAMPLING]
+    power = np.where(valid, (thinned.real**2 + thinned.imag**2).mean(axis=1), 0.0)
+    out = np.zeros((len(minutes), n_sub + 2), np.float32)
+    for w, (lo, hi) in enumerate(zip(start, stop, strict=True)):
+        sub = np.clip(np.floor((times[lo:hi] - minutes[w]) / length + 0.5 * n_sub).astype(int), 0, n_sub - 1)
+        out[w, :n_sub] = np.minimum(np.bincount(sub, valid[lo:hi], n_sub) * hop / length, 1.0)
+        out[w, n_sub] = np.log(max(power[lo:hi].sum() / max(valid[lo:hi].sum(), 1), 1e-3))
+    still = energy[:, :, energy.shape[2] // 2]
+    out[:, n_sub + 1] = np.log(np.maximum(still.mean(axis=(1, 2)), 1e-3))
+    return out
 
 
 def analytic_cepstrum(

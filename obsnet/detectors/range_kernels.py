@@ -61,29 +61,34 @@ def hinge(energy):
 
 
 @njit(cache=True, nogil=True)
-def gather(analytic, valid, frame_time, start, stop, minutes, window, range_m, rate, delay, phase, pad, fine_m,
-           lag_step, sub_s, patch, energy):  # fmt: skip
-    """Patches of analytic cepstrum around the delays of hypotheses, stacked along their drift in sub-windows.
+def describe(
+    analytic, valid, frame_time, start, stop, minutes, energy, score, once, window, range_m, rate, index, seconds,
+    slope, phase, inverse, pad, fine_m, coarse_m, rates, lag_step, sub_s, n_sub, n_lags, depth_m, out,
+):  # fmt: skip
+    """Feature vectors of hypotheses: patches stacked along their drift in sub-windows, each pair's context, globals.
 
     Parameters
     ----------
+    analytic … minutes, energy : as of `pair_energy`. score : of `cheap_score`. once : (n_windows, n) said once a minute.
     window : (n) index into `minutes` of each hypothesis. range_m, rate : (n) m and m/s.
-    phase : (n_pairs, n_fine) complex64 unit phasor by which a pair's predicted phase is taken off.
+    index, seconds, slope, phase, inverse, pad, fine_m, coarse_m : of `DelayTable`.
     lag_step : quefrency samples from one lag to the next. sub_s : length of a sub-window, s.
-    patch : (n, n_pairs, n_sub, n_lags, 2) float32, overwritten: in phase and in quadrature, of unit variance together.
-    energy : (n, n_pairs) float32, overwritten: of the whole window at the predicted delay.
+    out : (n, size) float32, overwritten.
     """
-    n_pairs, n_sub, n_lags = patch.shape[1:4]
-    last = analytic.shape[1] - 1
+    n_pairs, last = index.shape[0], analytic.shape[1] - 1
+    size = 2 * n_sub * n_lags
     sums = np.empty((n_sub, n_lags), np.complex64)
     count = np.empty(n_sub)
     for h in range(range_m.shape[0]):
         w = window[h]
+        row = out[h]
         centre = pad + int(np.rint(range_m[h] / fine_m))
         for p in range(n_pairs):
-            patch[h, p] = 0.0
-            energy[h, p] = 0.0
-            if delay[p, centre] == last:
+            patch = row[p * size : (p + 1) * size]
+            context = row[n_pairs * size + 6 * p : n_pairs * size + 6 * p + 6]
+            if index[p, centre] == last:
+                patch[:] = 0.0
+                context[:] = 0.0
                 continue
             sums[:] = 0.0
             count[:] = 0.0
@@ -91,60 +96,100 @@ def gather(analytic, valid, frame_time, start, stop, minutes, window, range_m, r
                 if not valid[t]:
                     continue
                 later = frame_time[t] - minutes[w]
-                j = delay[p, pad + int(np.rint((range_m[h] + rate[h] * later) / fine_m))]
+                j = index[p, pad + int(np.rint((range_m[h] + rate[h] * later) / fine_m))]
                 s = min(max(int(np.floor(later / sub_s + 0.5 * n_sub)), 0), n_sub - 1)
                 count[s] += 1.0
                 if j == last:
                     continue
                 j -= lag_step * (n_lags // 2)
-                row = analytic[t]
+                frame = analytic[t]
                 for q in range(n_lags):
-                    sums[s, q] += row[j + q * lag_step]
-            turn = phase[p, centre]
+                    sums[s, q] += frame[j + q * lag_step]
             total = np.complex64(0.0)
             for s in range(n_sub):
                 total += sums[s, n_lags // 2]
-                scale = np.float32(1.0 / np.sqrt(max(count[s], 1.0)))
+                turn = phase[p, centre] * np.float32(1.0 / np.sqrt(max(count[s], 1.0)))
                 for q in range(n_lags):
                     value = sums[s, q] * turn
-                    patch[h, p, s, q, 0] = value.real * scale
-                    patch[h, p, s, q, 1] = value.imag * scale
-            energy[h, p] = (total.real**2 + total.imag**2) / max(count.sum(), 1.0)
+                    patch[2 * (s * n_lags + q)] = value.real
+                    patch[2 * (s * n_lags + q) + 1] = value.imag
+            context[0] = 1.0
+            context[1] = np.log1p((total.real**2 + total.imag**2) / max(count.sum(), 1.0))
+            context[2] = np.log1p(ghost(energy, score, w, p, centre, rate[h], index, slope, inverse, pad, fine_m,
+                                        coarse_m, rates))  # fmt: skip
+            context[3] = 1e4 * slope[p, centre]
+            context[4] = np.log(seconds[p, centre])
+            context[5] = np.abs(1e3 * slope[p, centre] * rate[h])
+        row[n_pairs * (size + 6)] = range_m[h] / depth_m
+        row[n_pairs * (size + 6) + 1 :] = once[w]
 
 
 @njit(cache=True, nogil=True)
-def ghosts(energy, score, window, range_m, rate, delay, slope, inverse, pad, fine_m, coarse_m, rates, out):
-    """Cheap score that other pairs give to the ranges at which another pair has this pair's delay.
+def ghost(energy, score, w, p, centre, rate, index, slope, inverse, pad, fine_m, coarse_m, rates):
+    """Cheap score that other pairs give to the ranges at which another pair q has pair p's delay, the largest over q.
 
     A ridge at pair p's delay may be pair q's, of a ship at another range; that ship's other pairs then show elsewhere.
+    `inverse` is the coarse range at which a pair has a delay; q's own share of the score there is left out.
+    """
+    n_pairs, n_rates, n_range = energy.shape[1:]
+    best = np.float32(0.0)
+    j = index[p, centre]
+    for q in range(n_pairs):
+        i = inverse[q, j]
+        if q == p or i < 0:
+            continue
+        there = slope[q, pad + int(np.rint(i * coarse_m / fine_m))]
+        if there == 0.0:
+            continue
+        k = int(np.rint((rate * slope[p, centre] / there - rates[0]) / (rates[1] - rates[0])))
+        if k < 0 or k >= n_rates:
+            continue
+        for kk in range(max(k - 1, 0), min(k + 2, n_rates)):
+            for ii in range(max(i - 1, 0), min(i + 2, n_range)):
+                best = max(best, score[w, kk, ii] - hinge(energy[w, q, kk, ii]))
+    return best
+
+
+@njit(cache=True, nogil=True)
+def peak_columns(score, peaks, spread):
+    """Ranges at and around the highest peaks, over range rate, of each window's score.
 
     Parameters
     ----------
-    energy, score : of `pair_energy` and `cheap_score`.
-    slope : (n_pairs, n_fine) dτ/dr [s/m].
-    inverse : (n_pairs, n_quefrency + 1) int32, coarse range at which a pair has a delay, −1 where none.
-    rates : grid of `energy`, evenly spaced, m/s.
-    out : (n, n_pairs) float32, overwritten: the largest over q of the score at that range without pair q's own share.
+    score : (n_windows, n_rates, n_range) float32.
+    peaks : how many, kept `spread` + 1 ranges apart at least. spread : ranges to either side that belong to a peak.
+
+    Returns
+    -------
+    bool array (n_windows, n_range).
     """
-    n_pairs, n_rates, n_range = energy.shape[1:]
-    step = rates[1] - rates[0]
-    for h in range(range_m.shape[0]):
-        w = window[h]
-        centre = pad + int(np.rint(range_m[h] / fine_m))
-        for p in range(n_pairs):
-            best = np.float32(0.0)
-            j = delay[p, centre]
-            for q in range(n_pairs):
-                i = inverse[q, j]
-                if q == p or i < 0:
-                    continue
-                there = slope[q, pad + int(np.rint(i * coarse_m / fine_m))]
-                if there == 0.0:
-                    continue
-                k = int(np.rint((rate[h] * slope[p, centre] / there - rates[0]) / step))
-                if k < 0 or k >= n_rates:
-                    continue
-                for kk in range(max(k - 1, 0), min(k + 2, n_rates)):
-                    for ii in range(max(i - 1, 0), min(i + 2, n_range)):
-                        best = max(best, score[w, kk, ii] - hinge(energy[w, q, kk, ii]))
-            out[h, p] = best
+    n_windows, n_rates, n_range = score.shape
+    chosen = np.zeros((n_windows, n_range), np.bool_)
+    best = np.empty(n_range, np.float32)
+    for w in range(n_windows):
+        best[:] = score[w, 0]
+        for k in range(1, n_rates):
+            for i in range(n_range):
+                best[i] = max(best[i], score[w, k, i])
+        for _ in range(peaks):
+            top = np.argmax(best)
+            if best[top] <= 0.0:
+                break
+            for i in range(max(top - spread, 0), min(top + spread + 1, n_range)):
+                chosen[w, i] = True
+                best[i] = -1.0
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def resample(coarse, range_below, range_weight, rate_below, rate_weight, fine):
+    """Bilinear interpolation of (n_windows, rate, range) onto (n_windows, range, rate), overwritten."""
+    row = np.empty(coarse.shape[1], np.float32)
+    for w in range(fine.shape[0]):
+        for i in range(fine.shape[1]):
+            b, a = range_below[i], range_weight[i]
+            for k in range(coarse.shape[1]):
+                row[k] = (np.float32(1.0) - a) * coarse[w, k, b] + a * coarse[w, k, b + 1]
+            for k in range(fine.shape[2]):
+                c, d = rate_below[k], rate_weight[k]
+                fine[w, i, k] = (np.float32(1.0) - d) * row[c] + d * row[c + 1]

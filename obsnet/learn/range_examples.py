@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from obsnet.detectors.range_features import RangeFeatures, RangeFeaturesConfig, Window
+from obsnet.detectors.range_features import RangeFeatures, RangeFeaturesConfig
 from obsnet.errors import ConfigError
 from obsnet.layout import to_posix
+from obsnet.ocean.rays import interpolate
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class RangeExamplesConfig:
     shares : of the draws by cheap score, around the truth, at the truth's ghosts, and by the prior alone.
     score_power : the cheap score's weight in its share of the draws.
     mask_m, mask_share : another ship's neighbourhood, in which hypotheses are neither true nor false.
+    beliefs : tables to see each record through: the one that is given and mistaken ones, see `mistaken`.
+    scale_error, speed_error : of those, standard deviations, relative.
     """
 
     hypotheses: int = 40
@@ -36,6 +39,9 @@ class RangeExamplesConfig:
     score_power: float = 3.0
     mask_m: float = 800.0
     mask_share: float = 0.05
+    beliefs: int = 2
+    scale_error: float = 0.002
+    speed_error: float = 0.0015
 
     def __post_init__(self) -> None:
         if len(self.shares) != 4 or abs(sum(self.shares) - 1.0) > 1e-6 or self.shares[3] <= 0:
@@ -75,6 +81,33 @@ def range_examples(
     -------
     dict of arrays, see `FIELDS`.
     """
+    tables = [believed] + [mistaken(believed, generator, config) for _ in range(config.beliefs - 1)]
+    parts = [_seen_through(table, cepstrogram, truth, generator, config, features, known) for table in tables]
+    return {name: np.concatenate([part[name] for part in parts]) for name in FIELDS}
+
+
+def mistaken(table: xr.Dataset, generator: np.random.Generator, config: RangeExamplesConfig) -> xr.Dataset:
+    """Propagation table of a slightly other depth and sound speed: τ(r) becomes (s/q) τ(r/s) for errors s and q."""
+    scale = 1.0 + config.scale_error * generator.standard_normal()
+    speed = 1.0 + config.speed_error * generator.standard_normal()
+    ranges = table["range"].values
+    moved = table.assign_coords(range=ranges * scale)
+    moved = moved.assign(
+        delay=table["delay"].variable * (scale / speed), slowness=table["slowness"].variable / speed
+    )
+    moved = moved.assign_attrs(depth_m=scale * table.attrs["depth_m"])
+    return interpolate(moved, ranges[ranges <= scale * ranges[-1]])
+
+
+def _seen_through(
+    believed: xr.Dataset,
+    cepstrogram: xr.DataArray,
+    truth: pd.DataFrame,
+    generator: np.random.Generator,
+    config: RangeExamplesConfig,
+    features: RangeFeaturesConfig,
+    known: np.ndarray | None,
+) -> dict[str, np.ndarray]:
     front = RangeFeatures(believed, features)
     minutes = _minutes(cepstrogram, features.window_s)
     if known is not None:
@@ -84,13 +117,11 @@ def range_examples(
     if not chosen:
         return _empty(config, features)
     rows = np.unique([row for row, _ in chosen])
-    window = front.window(cepstrogram, minutes[rows])
-    covered = np.array([window.valid[a:b].sum() for a, b in zip(window.start, window.stop, strict=True)]) > 0
-    energy = front.energies(window)
-    score = front.scores(energy)
+    look = front.look(cepstrogram, minutes[rows])
+    covered = np.array([look.valid[a:b].sum() for a, b in zip(look.start, look.stop, strict=True)]) > 0
     place = {row: i for i, row in enumerate(rows)}
     parts = [
-        _example(front, window, energy, score, place[row], ships[row], ship, generator, config)
+        _example(front, look.score[place[row]], place[row], ships[row], ship, generator, config)
         for row, ship in chosen
         if covered[place[row]]
     ]
@@ -98,7 +129,7 @@ def range_examples(
         return _empty(config, features)
     index, range_m, rate, log_proposal, real = (np.stack(values) for values in zip(*parts, strict=True))
     shape = range_m.shape
-    found = front.features(window, energy, score, index.ravel(), range_m.ravel(), rate.ravel())
+    found = front.features(look, index.ravel(), range_m.ravel(), rate.ravel())
     found = found.reshape(*shape, -1)
     found[~real, 0] = 0.0
     return {
@@ -106,7 +137,7 @@ def range_examples(
         "range_m": range_m.astype(np.float32),
         "log_proposal": log_proposal.astype(np.float32),
         "ship": real,
-        "time": window.minutes[index[:, 0]],
+        "time": look.minutes[index[:, 0]],
     }
 
 
@@ -174,8 +205,6 @@ def _choose(
 
 def _example(
     front: RangeFeatures,
-    window: Window,
-    energy: np.ndarray,
     score: np.ndarray,
     place: int,
     ships: _Ships,
@@ -185,9 +214,9 @@ def _example(
 ) -> tuple[np.ndarray, ...]:
     """Minute index, ranges, rates, log proposals and truth flag of one example."""
     grid, rates = front.config.range_m, front.config.range_rate
-    prior = np.broadcast_to(np.maximum(grid, grid[1]), score[place].shape)
+    prior = np.broadcast_to(np.maximum(grid, grid[1]), score.shape)
     prior = prior / prior.sum()
-    by_score = prior * (1.0 + score[place]) ** config.score_power
+    by_score = prior * (1.0 + score) ** config.score_power
     mixture = [by_score / by_score.sum(), None, None, prior]
     if ship >= 0:
         mixture[1] = _near(grid, rates, [ships.range_m[ship]], 5.0)

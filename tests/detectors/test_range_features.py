@@ -41,11 +41,9 @@ def cepstra(values, times):
 
 
 def everything(front, cepstrogram, minutes, range_m, rate):
-    window = front.window(cepstrogram, minutes)
-    energy = front.energies(window)
-    score = front.scores(energy)
+    look = front.look(cepstrogram, minutes)
     index = np.zeros(len(range_m), int)
-    return energy, score, front.features(window, energy, score, index, np.array(range_m), np.array(rate))
+    return look.energy, look.score, front.features(look, index, np.array(range_m), np.array(rate))
 
 
 def test_noise_has_unit_variance_in_the_analytic_cepstrum():
@@ -154,6 +152,6 @@ def test_bad_configurations_are_refused(table):
     with pytest.raises(ConfigError, match="multiple of 10 m"):
         RangeFeaturesConfig(range_step_m=77.0)
     with pytest.raises(ConfigError, match="depth_m"):
-        RangeFeatures(table.assign_attrs(depth_m=np.nan)).window(
+        RangeFeatures(table.assign_attrs(depth_m=np.nan)).look(
             cepstra(np.zeros((513, 3)), START + np.arange(3)), [START]
         )

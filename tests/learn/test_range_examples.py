@@ -10,9 +10,13 @@ from obsnet.learn.range_examples import (
     FIELDS,
     RangeExamplesConfig,
     log_prior,
+    mistaken,
     range_density,
     range_examples,
 )
+from obsnet.ocean.bottom import Bottom
+from obsnet.ocean.rays import propagation
+from obsnet.ocean.sound_speed import SoundSpeed
 from obsnet.signals.cepstrogram import noise_std
 
 START = 1_369_130_400.0
@@ -69,7 +73,7 @@ def test_importance_weights_restore_the_prior(noise, ocean):
 
 def test_records_without_a_ship_give_examples_without_one(noise, ocean):
     made = draw(noise, ocean, truth())
-    assert len(made["ship"]) == 3
+    assert len(made["ship"]) == 3 * CONFIG.beliefs
     assert not made["ship"].any()
     assert not made["features"][:, 0].any()
 
@@ -129,3 +133,20 @@ def test_oceans_are_believed_with_errors_but_not_absurd_ones():
         at = np.abs(error.sel(range=7000.0)).max("path")
         assert 1e-4 < float(at) < 0.12
         assert not 2700.0 < ocean.depth_m < 3100.0
+
+
+def test_a_mistaken_table_is_that_of_another_depth_and_speed():
+    ranges = np.arange(0.0, 40e3, 70.0)
+    table = propagation(SoundSpeed.constant(1500.0), 4000.0, Bottom(), ranges)
+
+    class Fixed:
+        values = iter((2.0, -1.0))
+
+        def standard_normal(self):
+            return next(self.values)
+
+    config = RangeExamplesConfig(scale_error=0.005, speed_error=0.002)
+    wrong = mistaken(table, Fixed(), config)
+    other = propagation(SoundSpeed.constant(1500.0 * 0.998), 4040.0, Bottom(), wrong["range"].values)
+    np.testing.assert_allclose(wrong["delay"], other["delay"], atol=2e-5)
+    np.testing.assert_allclose(wrong["slowness"], other["slowness"], atol=2e-8)
