@@ -15,14 +15,19 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d
-from scipy.special import gammaln
 
-from obsnet import netcdf
 from obsnet.errors import ConfigError
-from obsnet.kinematics import StraightCourse, wrap180
-from obsnet.layout import to_posix
+from obsnet.kinematics import StraightCourse
 from obsnet.trackers import search_kernels
+from obsnet.trackers.posterior import posterior
+from obsnet.trackers.score_maps import (
+    ScoreMaps,
+    azimuth_scores,
+    lobe,
+    polyphase,
+    range_scores,
+    tiles,
+)
 from obsnet.trackers.track import Segment, Track
 
 
@@ -85,17 +90,6 @@ MEDIUM = _Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
 FINE = _Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
 
 
-@dataclass(frozen=True)
-class _Scores:
-    """Score maps of the tiles: smoothed, mixed with the chance of a miss, ready for the kernels."""
-
-    range_score: np.ndarray
-    geometry: np.ndarray
-    azimuth_score: np.ndarray
-    azimuth_step: float
-    jointly: bool
-
-
 def search(
     maps: xr.Dataset,
     segment: Segment,
@@ -120,10 +114,10 @@ def search(
 
     Source: Trabattoni et al. 2023, section III.E.
     """
-    tiles = _tiles(maps, segment, config)
-    if tiles is None:
+    read = tiles(maps, segment, config.tile_s)
+    if read is None:
         return []
-    times, azimuth_llr, range_llr = tiles
+    times, azimuth_llr, range_llr = read
     finder = _Finder(maps, times, segment, delay, config, threads)
     for track in known:
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
@@ -134,7 +128,7 @@ def search(
         least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
         if found is None or found.log_bayes_factor < least:
             break
-        if finder.believable(found):
+        if finder.believable(found) and (found.extra["heard"] >= 0.5 or not (tracks or known)):
             tracks.append(found)
         azimuth_llr, range_llr = finder.without(found, azimuth_llr, range_llr)
     return tracks
@@ -170,8 +164,8 @@ class _Finder:
 
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
-        coarse = self._scores(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
-        fine = self._scores(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
+        coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
+        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
         best: tuple[float, np.ndarray] | None = None
         for start in self._coarse(coarse):
             value, point = self._level(start, MEDIUM, fine)
@@ -180,15 +174,16 @@ class _Finder:
         if best is None or best[0] <= 0.0:
             return None
         value, point = self._level(best[1], FINE, fine)
-        return self._posterior(point, fine)
+        return self._track(point, fine)
 
-    def _coarse(self, scores: _Scores) -> list[np.ndarray]:
+    def _coarse(self, scores: ScoreMaps) -> list[np.ndarray]:
         """The best hypotheses of the whole prior, apart from each other, best first."""
         config = self.config
         step = config.tile_s
         edge = self.tiles[-1]
         cpa_time = np.arange(-1800.0, edge + 1800.0 + step, step)
-        if self.segment.cpa is not None:
+        # The segment's turn from closing to opening is the loudest ship's.
+        if self.segment.cpa is not None and not scores.jointly:
             near = abs(cpa_time - (self.segment.cpa - self.origin)) <= 3600.0
             cpa_time = cpa_time[near] if near.any() else cpa_time
         half = 1000.0 * int(config.max_cpa_range_m / 1000.0)
@@ -211,7 +206,7 @@ class _Finder:
             values[around] = -1.0
         return found
 
-    def _level(self, centre: np.ndarray, level: _Level, scores: _Scores) -> tuple[float, np.ndarray]:
+    def _level(self, centre: np.ndarray, level: _Level, scores: ScoreMaps) -> tuple[float, np.ndarray]:
         """Best score and hypothesis of a grid around `centre`."""
         axes = [
             c + np.arange(-h, h + s / 2, s) for c, h, s in zip(centre, level.half, level.step, strict=True)
@@ -229,7 +224,7 @@ class _Finder:
         cpa_range: np.ndarray,
         speed: np.ndarray,
         course: np.ndarray,
-        scores: _Scores,
+        scores: ScoreMaps,
     ) -> np.ndarray:
         """Score of every hypothesis of a grid, (n_cpa_time, n_cpa_range, n_speed, n_course) float32."""
         offset, index = np.unique(np.round(self.tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
@@ -239,7 +234,7 @@ class _Finder:
         row = np.empty(shape, np.int32)
         out = np.empty((len(cpa_time), len(cpa_range), len(speed), len(course)), np.float32)
         course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
-        rows, step = _polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
+        rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
         phases, length = rows.shape[1:]
         flat = rows.reshape(len(rows), -1)
 
@@ -268,7 +263,7 @@ class _Finder:
             list(pool.map(task, parts))
 
     def _score_points(
-        self, points: np.ndarray, scores: _Scores, keep_tiles: bool = False
+        self, points: np.ndarray, scores: ScoreMaps, keep_tiles: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Score of each hypothesis, and each tile's share of it where asked for."""
         out = np.empty(len(points))
@@ -279,25 +274,17 @@ class _Finder:
         )  # fmt: skip
         return out, per_tile
 
-    def _posterior(self, best: np.ndarray, scores: _Scores) -> Track:
-        """Mean, covariance and evidence by adaptive importance sampling around the best hypothesis."""
+    def _track(self, best: np.ndarray, scores: ScoreMaps) -> Track:
+        """The posterior around the best hypothesis, as a track."""
         config = self.config
-        rng = np.random.default_rng(config.seed)
         seen = np.array([True, True, self.sees_course, True])
-        mean, cov = best.copy(), np.diag([60.0, 500.0, 3.0, 0.3]) ** 2
-        log_evidence = -np.inf
-        for _ in range(5):
-            points, log_proposal = _student(rng, mean, cov, config.samples, seen)
-            inside = self._inside(points)
-            log_target = np.where(inside, config.exponent * self._score_points(points, scores)[0], -np.inf)
-            log_weight = log_target - log_proposal
-            top = log_weight.max()
-            weight = np.exp(log_weight - top)
-            log_evidence = top + np.log(weight.mean())
-            weight /= weight.sum()
-            mean = best + weight @ _difference(points, best)
-            deviation = _difference(points, mean)
-            cov = (weight * deviation.T) @ deviation + np.diag([1.0, 10.0, 0.05, 0.005]) ** 2
+
+        def log_likelihood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            total, per_tile = self._score_points(points, scores, keep_tiles=True)
+            return config.exponent * total, config.exponent * per_tile
+
+        known = posterior(best, log_likelihood, self._inside, seen, samples=config.samples, seed=config.seed)
+        mean, cov = known.mean, known.covariance
         score, per_tile = self._score_points(best[None], scores, keep_tiles=True)
         lo, hi = _best_run(per_tile[:, 0])
         fixed = self._fixed_source(scores, lo, hi)
@@ -305,7 +292,7 @@ class _Finder:
         span = self.tiles[-1] + 3600.0
         volume = span * 2 * config.max_cpa_range_m * (config.max_speed_mps - config.min_speed_mps)
         volume *= 360.0 if self.sees_course else 0.5
-        log_bayes_factor = float(log_evidence - np.log(volume) - np.log(n * (n + 1) / 2))
+        log_bayes_factor = float(known.log_evidence - np.log(volume) - np.log(n * (n + 1) / 2))
         if not self.sees_course:
             cov[2, :] = cov[:, 2] = 0.0
             cov[2, 2] = np.inf
@@ -314,11 +301,12 @@ class _Finder:
         start, end = self.origin + self.tiles[lo], self.origin + self.tiles[hi]
         extra = {
             "score": float(score[0]),
+            "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }
         return Track(float(start), float(end), motion, cov, log_bayes_factor, method, extra)
 
-    def _fixed_source(self, scores: _Scores, lo: int, hi: int) -> float:
+    def _fixed_source(self, scores: ScoreMaps, lo: int, hi: int) -> float:
         """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
         if not self.sees_course:
             return 0.0
@@ -356,39 +344,32 @@ class _Finder:
             & (points[:, 0] <= self.tiles[-1] + 1800.0)
         )
 
-    def _scores(
+    def _score_maps(
         self,
         azimuth_llr: np.ndarray | None,
         range_llr: np.ndarray | None,
         jointly: bool,
         pool: int,
         stds: tuple[float, float, float],
-    ) -> _Scores:
+    ) -> ScoreMaps:
         """Score maps at one smoothing: range bins (of `pool` grid steps), azimuth [deg], range rate bins."""
-        config = self.config
-        n = len(self.tiles)
+        config, n = self.config, len(self.tiles)
         step = float(self.azimuth[1] - self.azimuth[0])
-        if azimuth_llr is None:
-            azimuth_score = np.zeros((n, len(self.azimuth)), np.float32)
-        else:
-            ratio, top = _bounded(azimuth_llr, config.tile_bound)
-            ratio = gaussian_filter1d(ratio, stds[1] / step, axis=1, mode="wrap")
-            azimuth_score = _mixed(ratio, top, config.azimuth_detection_probability)
-        spacing = float(self.range_m[1] - self.range_m[0]) * pool
+        azimuth_score = np.zeros((n, len(self.azimuth)), np.float32)
+        if azimuth_llr is not None:
+            azimuth_score = azimuth_scores(
+                azimuth_llr, stds[1] / step, config.tile_bound, config.azimuth_detection_probability
+            )
+        range_score = np.zeros((n, 2, 2), np.float32)
+        if range_llr is not None:
+            range_score = range_scores(
+                range_llr, pool, (stds[0], stds[2]), config.tile_bound, config.range_detection_probability
+            )
+        spacing = float(self.range_m[1] - self.range_m[0])
+        first = float(self.range_m[0]) + spacing * (pool - 1) / 2
         rate_step = float(self.rate[1] - self.rate[0])
-        if range_llr is None:
-            range_score = np.zeros((n, 2, 2), np.float32)
-        else:
-            ratio, top = _bounded(range_llr, config.tile_bound)
-            if pool > 1:
-                bins = ratio.shape[1] // pool
-                ratio = ratio[:, : bins * pool].reshape(n, bins, pool, -1).mean(axis=2)
-            ratio = gaussian_filter1d(ratio, stds[0], axis=1, mode="nearest", truncate=3.0)
-            ratio = gaussian_filter1d(ratio, stds[2], axis=2, mode="nearest", truncate=3.0)
-            range_score = _mixed(ratio, top, config.range_detection_probability)
-        first = float(self.range_m[0]) + (spacing - spacing / pool) / 2
-        geometry = np.array([first, spacing, float(self.rate[0]), rate_step])
-        return _Scores(range_score, geometry, azimuth_score, step, jointly)
+        geometry = np.array([first, spacing * pool, float(self.rate[0]), rate_step])
+        return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
 
     def without(
         self, track: Track, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None
@@ -404,103 +385,13 @@ class _Finder:
             )
         azimuth, distance, rate = track.motion.observables(emitted)
         if azimuth_llr is not None:
-            near = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= 30.0
-            azimuth_llr = np.where(near, np.minimum(azimuth_llr, 0.0), azimuth_llr)
+            explained = lobe(azimuth_llr, self.azimuth, azimuth)
+            azimuth_llr = np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr)
         if range_llr is not None:
             near = abs(self.range_m[None, :] - distance[:, None]) <= 3000.0
             rates = abs(self.rate[None, :] - rate[:, None]) <= 3.0
             range_llr = np.where(near[:, :, None] & rates[:, None, :], np.minimum(range_llr, 0.0), range_llr)
         return azimuth_llr, range_llr
-
-
-def _tiles(
-    maps: xr.Dataset, segment: Segment, config: GridSearchConfig
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None] | None:
-    """Tile times and the maps there, read from disk no further than that; none if there are fewer than three."""
-    times = to_posix(maps["time"].values)
-    inside = (times >= segment.start - 1e-6) & (times <= segment.end + 1e-6)
-    inside &= np.abs(times / config.tile_s - np.round(times / config.tile_s)) * config.tile_s < 0.5
-    chosen = np.flatnonzero(inside)
-    if len(chosen) < 3:
-        return None
-
-    def llr(name: str) -> np.ndarray | None:
-        return netcdf.rows(maps[name], chosen) if name in maps else None
-
-    return times[chosen], llr("azimuth_llr"), llr("range_llr")
-
-
-def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """exp(llr − max) and the log at which the maximum counts, at most `bound`; tiles without data are 1 and NaN."""
-    top = llr.max(axis=tuple(range(1, llr.ndim)), keepdims=True)
-    ratio = np.exp(llr - top)
-    return np.nan_to_num(ratio, nan=1.0), np.minimum(top, bound)
-
-
-def _mixed(ratio: np.ndarray, top: np.ndarray, probability: float) -> np.ndarray:
-    """Log of (1 − Pd) + Pd·ratio·exp(top) (see `segmentation.mixture`); 0 where there is no data."""
-    share = np.float32(probability) * np.exp(np.nan_to_num(top)).astype(np.float32)
-    mixed = np.log(ratio * share + np.float32(1.0 - probability))
-    return np.where(np.isnan(top), np.float32(0.0), mixed)
-
-
-def _polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -> tuple[np.ndarray, float]:
-    """Azimuth rows laid out so that the courses of one hypothesis are neighbours in memory."""
-    if course_step < step:
-        finer = round(step / course_step)
-        count = rows.shape[1]
-        position = np.arange(count * finer) / finer
-        low = np.floor(position).astype(int)
-        mu = (position - low).astype(np.float32)
-        rows = (1 - mu) * rows[:, low] + mu * rows[:, (low + 1) % count]
-        step = step / finer
-    phases = max(1, round(course_step / step))
-    bins = rows.shape[1]
-    if bins % phases:
-        phases = 1 if courses == 1 else phases
-    wrapped = np.concatenate([rows, rows[:, np.arange(courses * phases) % bins]], axis=1)
-    length = wrapped.shape[1] // phases
-    laid = wrapped[:, : length * phases].reshape(len(rows), length, phases).transpose(0, 2, 1)
-    return np.ascontiguousarray(laid, dtype=np.float32), step
-
-
-def _student(
-    rng: np.random.Generator,
-    mean: np.ndarray,
-    cov: np.ndarray,
-    count: int,
-    seen: np.ndarray,
-    dof: float = 5.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws from a multivariate t over the parameters that are seen, and the log density of each."""
-    d = int(seen.sum())
-    root = np.linalg.cholesky(cov[np.ix_(seen, seen)] * 1.5)
-    z = rng.standard_normal((count, d)) / np.sqrt(rng.chisquare(dof, (count, 1)) / dof)
-    points = np.tile(mean, (count, 1))
-    points[:, seen] += z @ root.T
-    points[:, 2] %= 360.0
-    constant = (
-        gammaln((dof + d) / 2)
-        - gammaln(dof / 2)
-        - 0.5 * d * np.log(dof * np.pi)
-        - np.log(np.diag(root)).sum()
-    )
-    return points, constant - 0.5 * (dof + d) * np.log1p((z**2).sum(axis=1) / dof)
-
-
-def _difference(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    difference = points - centre
-    difference[:, 2] = wrap180(difference[:, 2])
-    return difference
-
-
-def _best_run(values: np.ndarray) -> tuple[int, int]:
-    """First and last index of the run of greatest sum."""
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    lowest = np.minimum.accumulate(total[:-1])
-    end = int(np.argmax(total[1:] - lowest))
-    start = int(np.argmin(total[: end + 1]))
-    return start, end
 
 
 def _near(index: Any, reach: int, count: int) -> np.ndarray:
@@ -511,3 +402,12 @@ def _blind(sees_course: bool) -> str:
     return (
         "grid search, no range maps" if sees_course else "grid search, no azimuth maps: course not observed"
     )
+
+
+def _best_run(values: np.ndarray) -> tuple[int, int]:
+    """First and last index of the run of greatest sum."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    lowest = np.minimum.accumulate(total[:-1])
+    end = int(np.argmax(total[1:] - lowest))
+    start = int(np.argmin(total[: end + 1]))
+    return start, end

@@ -7,6 +7,7 @@ import xarray as xr
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
 from obsnet.trackers.grid_search import GridSearchConfig, search
+from obsnet.trackers.score_maps import lobe
 from obsnet.trackers.track import Segment
 
 T0 = 1_369_123_200.0
@@ -95,6 +96,32 @@ def test_two_ships_at_once_are_two_tracks():
             )
             < 600
         )
+
+
+def test_a_further_ship_may_pass_hours_from_the_segments_turn():
+    """The segment's turn from closing to opening is the first ship's alone."""
+    ships = [
+        StraightCourse(T0 + 2500.0, 12_000.0, 60.0, 9.0),
+        StraightCourse(T0 + 12_000.0, -9_000.0, 240.0, 7.0),
+    ]
+    segment = Segment(MINUTES[0], MINUTES[-1], T0 + 2500.0)
+    tracks = search(maps_of(ships, MINUTES, np.random.default_rng(7)), segment, delay)
+    assert len(tracks) == 2
+    assert min(abs(t.motion.cpa_time - ships[1].cpa_time) for t in tracks) < 60.0
+
+
+def test_lobe_of_a_ship_ends_where_anothers_begins():
+    azimuth = np.arange(360.0)
+    row = 10.0 * np.exp(-0.5 * ((azimuth - 100.0) / 6.0) ** 2) + 8.0 * np.exp(
+        -0.5 * ((azimuth - 125.0) / 4.0) ** 2
+    )
+    explained = lobe(row[None].astype(np.float32) - 1.0, azimuth, np.array([98.0]))[0]
+    assert explained[88:109].all()
+    assert not explained[118:].any() and not explained[:68].any()
+    assert (
+        lobe(np.full((1, 360), 5.0), azimuth, np.array([1.0]))[0].nonzero()[0]
+        == [*range(32), *range(331, 360)]
+    ).all()
 
 
 def test_no_ship_gives_no_track():
