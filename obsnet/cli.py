@@ -290,6 +290,41 @@ def fetch(
         console.say(str(report))
 
 
+@app.command()
+def watch(
+    source: Annotated[
+        str,
+        typer.Argument(help="seedlink://HOST:PORT/NET.STA, a folder, or - for miniSEED on standard input."),
+    ],
+    station: StationFile,
+    out: Out,
+    code: Code = None,
+    detector: DetectorName = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    latency: Annotated[
+        float | None, typer.Option("--latency", help="How late a packet may come and be used [s].")
+    ] = None,
+    calibration: CalibrationFile = None,
+    propagation: PropagationFile = None,
+    orientation: Orientation = None,
+    hydrophone_polarity: Polarity = None,
+    depth: Depth = None,
+    latitude: Latitude = None,
+    longitude: Longitude = None,
+    once: Annotated[bool, typer.Option("--once", help="End when there is nothing more.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check everything, and end.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Keep detections and tracks up to date with waveforms as they come, unattended."""
+    commands.watch(
+        source, station, out, code=code, detector=detector, config=config, overrides=overrides, latency=latency,
+        calibration=calibration, propagation=propagation, orientation=orientation,
+        hydrophone_polarity=hydrophone_polarity, depth=depth, latitude=latitude, longitude=longitude, once=once, check=check,
+        quiet=quiet,
+    )  # fmt: skip
+
+
 EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
 
 

@@ -66,6 +66,50 @@ def track(
         _summary(run, out)
 
 
+def watch(
+    source: str,
+    station_file: Path,
+    out: Path,
+    *,
+    code: str | None = None,
+    detector: str | None = None,
+    config: Path | None = None,
+    overrides: list[str] | None = None,
+    latency: float | None = None,
+    calibration: Path | None = None,
+    propagation: Path | None = None,
+    orientation: float | None = None,
+    hydrophone_polarity: int | None = None,
+    depth: float | None = None,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    once: bool = False,
+    check: bool = False,
+    quiet: bool = False,
+) -> None:
+    """Read station and parameters and keep `out` up to date with what comes from the source."""
+    from obsnet.config import build
+    from obsnet.live.config import WatchConfig
+    from obsnet.live.watch import watch_source
+
+    values = _values(config, overrides, detector=detector)
+    if latency is not None:
+        section = values.setdefault("live", {})
+        if isinstance(section, dict):
+            section["latency_s"] = latency
+    settings = build(WatchConfig, values)
+    station = read_station(
+        station_file, code, None, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
+        latitude=latitude, longitude=longitude,
+    )  # fmt: skip
+    fitted = read_calibration(calibration)
+    watch_source(
+        source, fitted.apply(station) if fitted else station, settings, out, once=once, check=check,
+        amplitudes=fitted.amplitudes if fitted else None, table=read_table(propagation),
+        say=(lambda line: None) if quiet else console.say,
+    )  # fmt: skip
+
+
 def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
     """Say Table I of a run against AIS."""
     from obsnet.evaluation import evaluate_folder
@@ -81,15 +125,17 @@ def run_config(
     path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None
 ) -> RunConfig:
     """`RunConfig` of a YAML file, overrides of single parameters, and the choices made by options."""
-    from obsnet.config import build, merge_overrides, read_yaml
+    from obsnet.config import build
     from obsnet.pipeline import RunConfig
 
-    values = read_yaml(path) if path else {}
-    values = merge_overrides(values, overrides or [])
-    for key, value in (("detector", detector), ("tracker", tracker)):
-        if value is not None:
-            values[key] = value
-    return build(RunConfig, values)
+    return build(RunConfig, _values(path, overrides, detector=detector, tracker=tracker))
+
+
+def _values(path: Path | None, overrides: list[str] | None, **chosen: str | None) -> dict[str, Any]:
+    from obsnet.config import merge_overrides, read_yaml
+
+    values = merge_overrides(read_yaml(path) if path else {}, overrides or [])
+    return values | {key: value for key, value in chosen.items() if value is not None}
 
 
 def read_station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:

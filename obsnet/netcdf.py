@@ -46,7 +46,7 @@ class TimeWriter:
             self._file.resize_dimension("time", stop)
             self._file.variables["time"][time:stop] = to_posix(block["time"].values)
             for name, values in _real(block).items():
-                self._file.variables[name][time:stop] = _pack(name, values.transpose("time", ...).values)
+                self._file.variables[name][time:stop] = pack(name, values.transpose("time", ...).values)
         except OSError as error:
             raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from None
         self._require_written()
@@ -176,9 +176,7 @@ def rows(values: xr.DataArray, index: np.ndarray) -> np.ndarray:
                 block = packed[part[0] : part[-1] + 1][part - part[0]]
             else:
                 block = np.stack([packed[row] for row in part])
-            here = chosen[start : start + 64]
-            np.multiply(block, np.float32(PACKED[name]), out=here, casting="unsafe")
-            here[block == _FILL] = np.nan
+            chosen[start : start + 64] = unpack(name, block)
     return chosen
 
 
@@ -201,8 +199,16 @@ def _real(block: xr.Dataset) -> dict[str, xr.DataArray]:
     return variables
 
 
-def _pack(name: str, values: np.ndarray) -> np.ndarray:
+def pack(name: str, values: np.ndarray) -> np.ndarray:
+    """Values of a variable as a file holds them."""
     if name not in PACKED:
         return values
     scaled = np.rint(np.clip(values, -1600.0, 1600.0) / np.float32(PACKED[name]))
     return np.where(np.isnan(scaled), np.float32(_FILL), scaled).astype(np.int16)
+
+
+def unpack(name: str, packed: np.ndarray) -> np.ndarray:
+    """Values of a variable from what `pack` made of them."""
+    if name not in PACKED:
+        return packed
+    return np.where(packed == _FILL, np.float32(np.nan), packed * np.float32(PACKED[name]))

@@ -155,6 +155,11 @@ class Pipeline:
         names = ("range_mode_m", "mode_probability", "range_mean_m", "range_std_m", "range_rate_mps")
         return pd.DataFrame(table | {name: joined(name) for name in (*names, "range_rate_std_mps")})
 
+    @property
+    def next_minute(self) -> float | None:
+        """The next minute to be finished, s since 1970; None before the first frame."""
+        return self._next
+
     def state(self) -> dict[str, np.ndarray]:
         """All that the next minute depends on, for a station that must survive; arrays by name, none changed in place.
 

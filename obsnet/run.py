@@ -368,6 +368,9 @@ DETECTION_COLUMNS = [
     "range_rate_mps",
     "range_llr",
 ]
+DETECTION_DIGITS = {
+    "coverage": 3, "azimuth_deg": 2, "azimuth_llr": 3, "range_m": 1, "range_rate_mps": 2, "range_llr": 3,
+}  # fmt: skip
 TRACK_COLUMNS = [
     "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
     "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
@@ -378,7 +381,7 @@ def write_tables(run: Run, folder: Path) -> None:
     """Write detections.csv, tracks.csv, tracks.geojson and run.json."""
     write_text(folder / "detections.csv", detections_csv(run.detections))
     rows = pd.DataFrame([found.row(i) for i, found in enumerate(run.tracks, 1)], columns=TRACK_COLUMNS)
-    write_text(folder / "tracks.csv", rows.to_csv(index=False, float_format="%.6g"))
+    write_text(folder / "tracks.csv", tracks_csv(rows))
     write_text(folder / "tracks.geojson", json.dumps(geojson(run.tracks, run.station)))
     if len(run.live):
         stamps = np.datetime_as_string(run.live["time"].to_numpy("datetime64[s]"))
@@ -392,15 +395,12 @@ def detections_csv(detections: pd.DataFrame) -> str:
     table = detections.reindex(columns=DETECTION_COLUMNS).copy()
     stamps = table["time"].to_numpy("datetime64[s]")
     table["time"] = np.char.add(np.datetime_as_string(stamps), "Z") if len(stamps) else table["time"]
-    digits = {
-        "coverage": 3,
-        "azimuth_deg": 2,
-        "azimuth_llr": 3,
-        "range_m": 1,
-        "range_rate_mps": 2,
-        "range_llr": 3,
-    }
-    return table.round(digits).to_csv(index=False)
+    return table.round(DETECTION_DIGITS).to_csv(index=False)
+
+
+def tracks_csv(rows: pd.DataFrame) -> str:
+    """Text of tracks.csv."""
+    return rows.to_csv(index=False, float_format="%.6g")
 
 
 def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from obsnet.signals.frames import FrameTransform, clipped, constant, touched
 from obsnet.signals.response import frequency_response
 from obsnet.signals.station import Channel, Station
 from obsnet.signals.timeline import Run
-from obsnet.signals.waveforms import WaveformReport, WaveformSource
+from obsnet.signals.waveforms import WaveformReport, Waveforms
 
 _BATCH_SAMPLES = 1 << 16
 _READ_SAMPLES = 1 << 22
@@ -22,7 +22,7 @@ class ChannelSpectra:
 
     Parameters
     ----------
-    source : WaveformSource
+    source : Waveforms
     frequency : ndarray (n,)
         Multiples of 1 / `window_s` from 0 Hz up.
     window_s, water_level_db, dead_s, clip_share : float
@@ -31,7 +31,7 @@ class ChannelSpectra:
 
     def __init__(
         self,
-        source: WaveformSource,
+        source: Waveforms,
         frequency: np.ndarray,
         window_s: float,
         water_level_db: float,

@@ -55,11 +55,12 @@ class ChannelRecords:
 
 @dataclass(frozen=True, eq=False)
 class RecordFile:
-    """Record length [bytes], the channels, and how many records (or a cut tail) are not readable."""
+    """Record length [bytes], the channels, how many records (or a cut tail) are not readable, and records up to the end."""
 
     length: int
     channels: tuple[ChannelRecords, ...]
     broken: int
+    rows: int
 
 
 class RecordReader:
@@ -98,11 +99,11 @@ class RecordReader:
         origin = channel.before[record]
         low = int(np.searchsorted(channel.before, origin + first, "right")) - 1
         high = int(np.searchsorted(channel.before, origin + last, "left"))
-        samples = self._decode(path, file.length, channel.table[low:high])
+        samples = self.decode(path, file.length, channel.table[low:high])
         skip = int(origin + first - channel.before[low])
         return samples[skip : skip + last - first]
 
-    def _decode(self, path: Path, length: int, table: np.ndarray) -> np.ndarray:
+    def decode(self, path: Path, length: int, table: np.ndarray) -> np.ndarray:
         """Samples of consecutive records; a record that does not decode gives NaN, the others are kept."""
         expected = int(table["count"].sum())
         try:
@@ -124,7 +125,7 @@ class RecordReader:
             self._say(f"{path.name}: some records do not decode; their samples are missing")
             return np.full(expected, np.nan, np.float32)
         middle = table.size // 2
-        halves = (self._decode(path, length, half) for half in (table[:middle], table[middle:]))
+        halves = (self.decode(path, length, half) for half in (table[:middle], table[middle:]))
         return np.concatenate(list(halves))
 
     def _say(self, text: str) -> None:
@@ -132,8 +133,8 @@ class RecordReader:
             self._note(text)
 
 
-def scan(path: Path) -> RecordFile | None:
-    """Index the records of a miniSEED file; None if it is anything else, or its records differ in length.
+def scan(path: Path, skip: int = 0) -> RecordFile | None:
+    """Index the records of a miniSEED file after the first `skip`; None unless miniSEED with records of one length.
 
     Raises
     ------
@@ -148,20 +149,20 @@ def scan(path: Path) -> RecordFile | None:
                 raise WaveformError("miniSEED with a damaged header")
             return None
         length, order = layout
-        file.seek(0)
-        parts, rows, tail = [], 0, 0
+        file.seek(skip * length)
+        parts, rows, tail = [], skip, 0
         while chunk := file.read(max(_CHUNK_BYTES // length, 1) * length):
             whole = len(chunk) // length
             parts.append(
                 _parse(np.frombuffer(chunk, np.uint8, whole * length).reshape(whole, length), order, rows)
             )
             rows, tail = rows + whole, len(chunk) - whole * length
-    table = np.concatenate(parts)
+    table = np.concatenate(parts) if parts else np.empty(0, _TABLE)
     good = table[table["valid"]]
-    if good.size < rows / 2 or good.size == 0:
+    if good.size < (rows - skip) / 2 or (good.size == 0 and skip == 0):
         return None
     channels = tuple(_channel(good[good["channel"] == code]) for code in np.unique(good["channel"]))
-    return RecordFile(length, channels, rows - good.size + (tail > 0))
+    return RecordFile(length, channels, rows - skip - good.size + (tail > 0), rows)
 
 
 def _channel(table: np.ndarray) -> ChannelRecords:

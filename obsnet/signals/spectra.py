@@ -29,10 +29,10 @@ from obsnet.layout import iso
 from obsnet.signals.channels import ChannelSpectra, rotation
 from obsnet.signals.response import described
 from obsnet.signals.station import Channel, Station
-from obsnet.signals.waveforms import WaveformSource, open_waveforms
+from obsnet.signals.waveforms import Waveforms, WaveformSource, open_waveforms
 
 _SECOND = 1_000_000_000
-_SILENCE_NS = 10 * 86400 * _SECOND
+SILENCE_NS = 10 * 86400 * _SECOND
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def _spans(source: WaveformSource, config: SpectraConfig) -> list[tuple[int, int
     hop, window = config.hop_ns, config.window_ns
     half = round(0.5 / config.analysis_rate_hz * _SECOND)
     asked = -(-(source.begin_ns - window // 2) // hop), -(-(source.end_ns - window // 2) // hop)
-    held, spans = source.covered(_SILENCE_NS), []
+    held, spans = source.covered(SILENCE_NS), []
     for begin, end in held:
         first = max(asked[0], -(-(begin - half) // hop))
         last = min(asked[1], (end + half - window) // hop + 1)
@@ -185,7 +185,7 @@ def _spans(source: WaveformSource, config: SpectraConfig) -> list[tuple[int, int
 class SpectraBuilder:
     """Makes the Dataset of a range of frames from the channels that serve at their times."""
 
-    def __init__(self, source: WaveformSource, config: SpectraConfig, first: int, last: int) -> None:
+    def __init__(self, source: Waveforms, config: SpectraConfig, first: int, last: int) -> None:
         self.source, self.config, self.frequency = source, config, config.frequency
         self._channels = ChannelSpectra(
             source, self.frequency, config.window_s, config.water_level_db, config.dead_s, config.clip_share

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import obspy
@@ -64,6 +64,18 @@ class WaveformReport:
     def to_dict(self) -> dict[str, Any]:
         """Nested plain dictionary."""
         return asdict(self)
+
+
+class Waveforms(Protocol):
+    """What spectra are made of: the timeline of every channel, whether of a record or of a live buffer."""
+
+    station: Station
+    timelines: dict[str, Timeline]
+    report: WaveformReport
+
+    def station_at(self, time_ns: int) -> Station:
+        """The station with the channels that have waveforms and an epoch at a time."""
+        ...
 
 
 class WaveformSource:

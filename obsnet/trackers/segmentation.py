@@ -70,20 +70,36 @@ def segments(
         name: _column(presence, name, config.range_detection_probability, config)
         for name in ("range", "approaching", "leaving")
     }
-    azimuth = _column(presence, "azimuth", config.azimuth_detection_probability, config)
-    wide = _odd(config.azimuth_average_min * 60.0 / step)
     narrow = _odd(config.range_average_min * 60.0 / step)
-    heard = _average(azimuth + level["range"], wide) > 0
+    heard, settled = _heard(presence, config)
+    settled = len(time) if ended else settled
     smooth = {name: _average(values, narrow) for name, values in level.items()}
     radial = heard & (smooth["range"] > 0)
     phase = np.where(radial & (smooth["approaching"] > smooth["leaving"]), -1, 0)
     phase = np.where(radial & (smooth["approaching"] < smooth["leaving"]), 1, phase)
-    settled = len(time) if ended else max(len(time) - wide // 2, 0)
     found: list[Segment] = []
     for lo, hi in _runs(heard[:settled]):
         pieces = _split(time, phase, lo, hi)
         found += pieces[:-1] if hi == settled and not ended else pieces
     return [segment for segment in found if segment.end - segment.start >= config.shortest_min * 60.0]
+
+
+def quiet_until(presence: pd.DataFrame, config: SegmentationConfig = SegmentationConfig()) -> float | None:
+    """Last minute [s since 1970] without a ship that no later minute can change; segments to come start after it."""
+    if len(presence) < 2:
+        return None
+    heard, settled = _heard(presence, config)
+    quiet = np.flatnonzero(~heard[:settled])
+    return float(presence.index[quiet[-1]]) if quiet.size else None
+
+
+def _heard(presence: pd.DataFrame, config: SegmentationConfig) -> tuple[np.ndarray, int]:
+    """In which minutes a ship is heard (eq. 24), and up to which one later minutes change nothing."""
+    step = float(presence.index[1] - presence.index[0])
+    level = _column(presence, "range", config.range_detection_probability, config)
+    azimuth = _column(presence, "azimuth", config.azimuth_detection_probability, config)
+    wide = _odd(config.azimuth_average_min * 60.0 / step)
+    return _average(azimuth + level, wide) > 0, max(len(presence) - wide // 2, 0)
 
 
 def _column(presence: pd.DataFrame, name: str, probability: float, config: SegmentationConfig) -> np.ndarray:

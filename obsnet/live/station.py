@@ -1,0 +1,449 @@
+"""A source of packets in; rows, estimates and tracks out, each committed with the state that it leaves behind."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import resource
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import obsnet
+from obsnet.config import to_dict
+from obsnet.errors import ObsnetError, OutputError
+from obsnet.layout import iso
+from obsnet.live.buffer import WaveformBuffer
+from obsnet.live.config import WatchConfig
+from obsnet.live.files import Files, rounded
+from obsnet.live.packets import Packet
+from obsnet.live.ships import LiveEstimate, Ships
+from obsnet.live.sources import Source
+from obsnet.live.store import LIVE_COLUMNS, Store, plain_rows
+from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.pipeline import Minutes, Pipeline
+from obsnet.run import DETECTION_COLUMNS
+from obsnet.signals.spectra import SpectraBuilder
+from obsnet.signals.station import Station
+
+_SECOND = 1_000_000_000
+_FOREVER = 1 << 29
+_REST_S = 5.0
+_STATUS_S = 60.0
+_BEHIND_S = 1800.0
+
+
+class LiveStation:
+    """A station that takes packets and survives: whatever it has said is stored with what it needs to go on.
+
+    Parameters
+    ----------
+    station : Station
+    config : WatchConfig
+    folder : output folder.
+    amplitudes, table : as for `Pipeline`.
+    say : called with a line for people when something happens.
+
+    Raises
+    ------
+    ObsnetError : the folder cannot be used, or station and configuration do not fit.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        config: WatchConfig,
+        folder: Path,
+        amplitudes: Amplitudes | None = None,
+        table: Any = None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.station, self.config, self.folder, self._say = station, config, folder, say
+        self._amplitudes = amplitudes
+        self.pipeline = Pipeline(station, config, amplitudes, table, config.live.threads)
+        self.store = Store(folder)
+        self.buffer = WaveformBuffer(station, config.spectra, config.live)
+        self.ships = Ships(self.store, station, config, self.pipeline.table)
+        self.estimate = LiveEstimate(station)
+        self.files = Files(folder, self.store, station, self.ships)
+        self.stopping = threading.Event()
+        self.source: Source | None = None
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []
+        self.health = Health(config.live.silence_s)
+        self._builder: SpectraBuilder | None = None
+        self._pending: list[Packet] = []
+        self._snapshot_frame: int | None = None
+        self._rested = self._fresh_at = time.monotonic()
+        self._told = -np.inf
+        self._restore()
+
+    def run(self, source: Source, once: bool = False) -> None:
+        """Take packets until the source ends or `stopping` is set; at the end of a record close it, if `once`."""
+        self.source = source
+        self.files.repair()
+        self.tell()
+        try:
+            for batch in source.batches():
+                self.take(batch, patient=not once)
+                if self.stopping.is_set():
+                    break
+                if time.monotonic() - self._told > _STATUS_S:
+                    self.tell()
+            if once and not self.stopping.is_set():
+                self.finish()
+            elif self.buffer.next_frame is not None:
+                self._lasting(self._snapshot, patient=False)
+        finally:
+            source.close()
+            self.tell()
+
+    def close(self) -> None:
+        """Release the database."""
+        self.store.close()
+
+    def take(self, packets: list[Packet], patient: bool = True) -> None:
+        """Take packets, and say what they finish."""
+        for packet in packets:
+            kept = self.buffer.add(packet)
+            if kept is not None:
+                self._pending.append(kept)
+                self._fresh_at = time.monotonic()
+        if packets:
+            self.health.heard()
+        first, last = self.buffer.ready()
+        if last > first and last >= self._wanted():
+            self._advance(first, last, patient)
+        if self._pending:
+            self._lasting(self._keep_pending, patient)
+        if packets and time.monotonic() - self._fresh_at > _BEHIND_S:
+            self.begin_anew("packets have been late for half an hour: the clock was set back", patient)
+
+    def finish(self) -> None:
+        """Say what is left when the record has ended; what a longer record would change is said again then."""
+        self.buffer.believe_all()
+        first, last = self.buffer.ready(ended=True)
+        if last > first:
+            self._advance(first, last, patient=False)
+        if self.buffer.next_frame is None:
+            return
+        self._lasting(self._snapshot, patient=False)
+        minutes = self.pipeline.flush()
+        if minutes is not None:
+            self._lasting(
+                lambda: self._keep_minutes(minutes, self.estimate.step(minutes.maps)), patient=False
+            )
+            self.files.append([str(t) for t in rounded(minutes.detections)["time"]])
+        ((last_track,),) = self.store.rows("SELECT coalesce(max(track), 0) FROM tracks")
+        closed = self.store.noted("closed")
+        self._lasting(lambda: self.store.note("provisional", [last_track, closed]), patient=False)
+        self._close_segments(ended=True, patient=False)
+
+    def begin_anew(self, why: str, patient: bool = True) -> None:
+        """Close the record and start another, as after a silence that is too long to have rows."""
+        self._say(why)
+        minutes = self.pipeline.flush()
+        if minutes is not None:
+            self._publish([minutes], patient)
+        self.pipeline = Pipeline(
+            self.station, self.config, self._amplitudes, self.pipeline.table, self.config.live.threads
+        )
+        self.buffer = WaveformBuffer(self.station, self.config.spectra, self.config.live)
+        self._builder, self._snapshot_frame, self._pending = None, None, []
+        self._fresh_at = time.monotonic()
+        self._lasting(self._forget, patient)
+
+    # --- frames ---
+
+    def _wanted(self) -> int:
+        """Frames needed, at least, to finish the next minute."""
+        following, spectra = self.pipeline.next_minute, self.config.spectra
+        if following is None:
+            return 0
+        centre = following + self.config.azimuth.window_s / 2 - spectra.hop_s
+        return int(np.ceil((centre - spectra.window_s / 2) / spectra.hop_s - 1e-6)) + 1
+
+    def _advance(self, first: int, last: int, patient: bool) -> None:
+        for begin, end, boundary in self._cuts(first, last):
+            finished = self._push(begin, end, patient)
+            self._publish(finished, patient, boundary)
+        self.buffer.forget()
+        self._close_segments(patient=patient)
+
+    def _push(self, begin: int, end: int, patient: bool = True) -> list[Minutes]:
+        self.buffer.take(end)
+        if self._builder is None or self._channels != self.buffer.seen:
+            self._make_builder(begin, patient)
+        assert self._builder is not None
+        return self.pipeline.push(self._builder.block(np.arange(begin, end)))
+
+    def _make_builder(self, frame: int, patient: bool) -> None:
+        """Fix which channels serve; one that appears late begins a new record if it changes what is known."""
+        before = None if self._builder is None else set(self._builder.units)
+        self._channels = self.buffer.seen
+        self._builder = SpectraBuilder(self.buffer, self.config.spectra, frame, frame + _FOREVER)
+        if before is not None and before != set(self._builder.units):
+            minutes = self.pipeline.flush()
+            if minutes is not None:
+                self._publish([minutes], patient)
+            self._say(f"channels are now {', '.join(self._channels)}: a new record begins")
+            self.pipeline = Pipeline(
+                self.station, self.config, self._amplitudes, self.pipeline.table, self.config.live.threads
+            )
+
+    def _cuts(self, first: int, last: int) -> Iterator[tuple[int, int, bool]]:
+        """Ranges of frames that end where a snapshot may be taken."""
+        hop, step = self.config.spectra.hop_s, self.config.live.snapshot_s
+        centre = self.config.spectra.window_s / 2
+        while first < last:
+            boundary = (np.floor((first * hop + centre) / step + 1e-9) + 1) * step
+            end = min(last, max(int(np.ceil((boundary - centre) / hop - 1e-9)), first + 1))
+            yield first, end, end * hop + centre >= boundary - 1e-6
+            first = end
+
+    # --- what is written ---
+
+    def _publish(self, finished: list[Minutes], patient: bool, boundary: bool = False) -> None:
+        """Commit minutes, the live estimate, the packets and the position; then the files made from them."""
+        rows = [row for minutes in finished for row in self.estimate.step(minutes.maps)]
+        due = boundary and (time.monotonic() - self._rested > _REST_S or self._snapshot_frame is None)
+
+        def write() -> None:
+            for minutes in finished:
+                self._keep_minutes(minutes, [])
+            self._keep_live(rows)
+            self._keep_pending()
+            if due or self._snapshot_frame is None:
+                self._snapshot()
+
+        if not finished and not due and self._snapshot_frame is not None:
+            self._lasting(self._keep_pending, patient)
+            return
+        self._lasting(write, patient)
+        if finished:
+            said = pd.concat([rounded(minutes.detections) for minutes in finished])
+            self.health.minute(said)
+            self.files.append([str(t) for t in said["time"]])
+            if self.stopping.is_set():
+                return
+            for listener in self.listeners if rows else []:
+                listener(rows[-1])
+
+    def _keep_minutes(self, minutes: Minutes, rows: list[dict[str, Any]]) -> None:
+        table = rounded(minutes.detections)
+        self.store.put("detections", DETECTION_COLUMNS, plain_rows(table, DETECTION_COLUMNS))
+        self.ships.keep(minutes)
+        self._keep_live(rows)
+
+    def _keep_live(self, rows: list[dict[str, Any]]) -> None:
+        self.store.put("live", LIVE_COLUMNS, [tuple(row.get(name) for name in LIVE_COLUMNS) for row in rows])
+
+    def _keep_pending(self) -> None:
+        for packet in self._pending:
+            self.store.put_packet(packet)
+        self.store.note("position", self._position())
+
+    def _snapshot(self) -> None:
+        """Keep the memory of all stages as of the next frame, and only the packets that come after it."""
+        self._keep_pending()
+        frame = self.buffer.next_frame
+        assert frame is not None
+        self.store.put_arrays("pipeline", self.pipeline.state())
+        self.store.put_arrays("estimate", self.estimate.state())
+        self.store.note(
+            "snapshot", {"frame": frame, "fingerprint": self.fingerprint, "channels": self.buffer.seen}
+        )
+        self.store.forget_packets(self.buffer.needed_ns)
+        self._snapshot_frame, self._rested = frame, time.monotonic()
+
+    def _forget(self) -> None:
+        for room in ("pipeline", "estimate"):
+            self.store.forget_arrays(room)
+        self.store.execute("DELETE FROM packets")
+        self.store.execute("DELETE FROM state WHERE name IN ('snapshot', 'grid', 'provisional')")
+        self.store.execute("DELETE FROM tiles")
+        self.store.execute("DELETE FROM presence")
+        self.store.note("position", self._position())
+        self.ships.reread()
+
+    def _position(self) -> dict[str, Any]:
+        return self.buffer.position() | {"source": self.source.position if self.source else {}}
+
+    def _lasting(self, write: Callable[[], None], patient: bool) -> None:
+        """Commit, if need be again and again: a full disk is waited for, and nothing is taken meanwhile."""
+        wait = self.config.live.retry_s
+        while True:
+            try:
+                with self.store.transaction():
+                    write()
+                self._pending = []
+                self.health.trouble = ""
+                return
+            except OutputError as error:
+                if not patient:
+                    raise
+                if not self.health.trouble:
+                    self._say(f"{error}; waiting")
+                self.health.trouble = str(error)
+                if self.stopping.wait(wait * random.uniform(0.5, 1.5)):
+                    raise
+                wait = min(2 * wait, self.config.live.retry_max_s)
+
+    def _close_segments(self, ended: bool = False, patient: bool = True) -> None:
+        for segment in self.ships.close(ended):
+            try:
+                tracks = self.ships.search(segment)
+            except ObsnetError as error:
+                self._say(f"the segment from {iso(segment.start)} to {iso(segment.end)} is left: {error}")
+                tracks = []
+            self._lasting(lambda s=segment, t=tracks: self.ships.say(s, t), patient)  # type: ignore[misc]
+            if tracks:
+                self._say(f"{len(tracks)} track(s) from {iso(segment.start)} to {iso(segment.end)}")
+            try:
+                self.files.write_tracks()
+            except OutputError as error:
+                self._say(str(error))
+
+    # --- going on after a stop ---
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of all that the stored memory depends on."""
+        place = (self.station.code, self.station.latitude, self.station.longitude, self.station.depth_m)
+        config = {key: value for key, value in to_dict(self.config).items() if key != "live"}
+        said = json.dumps([obsnet.__version__, place, config], sort_keys=True, default=str)
+        return hashlib.sha256(said.encode()).hexdigest()
+
+    def _restore(self) -> None:
+        position, snapshot = self.store.noted("position"), self.store.noted("snapshot")
+        self.resume = (position or {}).get("source", {})
+        if snapshot is None or position is None:
+            for packet in self.store.packets():
+                self.buffer.add(packet)
+            return
+        if snapshot["fingerprint"] != self.fingerprint:
+            self._say("station, configuration or version changed: a new record begins")
+            with self.store.transaction():
+                self._forget()
+            return
+        self._unsay_provisional()
+        self.pipeline.restore(self.store.arrays("pipeline"))
+        self.estimate.restore(self.store.arrays("estimate"))
+        for packet in self.store.packets():
+            self.buffer.add(packet)
+        self.buffer.restore(snapshot["frame"], snapshot["channels"], position)
+        self._snapshot_frame = snapshot["frame"]
+        self._channels = snapshot["channels"]
+        until = position["next_frame"]
+        for begin, end, _ in self._cuts(snapshot["frame"], until):
+            for minutes in self._push(begin, end):
+                self.estimate.step(minutes.maps)
+        if until > snapshot["frame"]:
+            self.buffer.forget()
+
+    def _unsay_provisional(self) -> None:
+        """Take back the tracks of a record that was closed and now goes on."""
+        provisional = self.store.noted("provisional")
+        if provisional is None:
+            return
+        track, closed = provisional
+        with self.store.transaction():
+            for table in ("tracks", "courses"):
+                self.store.execute(f"DELETE FROM {table} WHERE track > ?", (track,))
+            self.store.execute("DELETE FROM state WHERE name IN ('provisional', 'closed')")
+            if closed is not None:
+                self.store.note("closed", closed)
+        self.ships.reread()
+
+    # --- what it says of itself ---
+
+    def tell(self) -> None:
+        """Rewrite status.json."""
+        self._told = time.monotonic()
+        try:
+            self.files.write_status(self.status())
+        except OutputError as error:
+            self.health.trouble = self.health.trouble or str(error)
+
+    def status(self) -> dict[str, Any]:
+        """What the station does and how it is, as plain values."""
+        head = self.buffer.head_ns
+        source = self.source
+        ((tracks,),) = self.store.rows("SELECT count(*) FROM tracks")
+        live = self.store.rows(f"SELECT {', '.join(LIVE_COLUMNS)} FROM live ORDER BY time DESC LIMIT 1")
+        scale = 1024 if sys.platform != "darwin" else 1024**2
+        return {
+            "obsnet": obsnet.__version__,
+            "time": iso(time.time()),
+            "station": {
+                "code": self.station.code,
+                "latitude": self.station.latitude,
+                "longitude": self.station.longitude,
+                "depth_m": self.station.depth_m,
+            },
+            "source": None if source is None else source.name,
+            "detector": self.config.detector,
+            "models": getattr(self.pipeline, "models", {}),
+            **self.health.said(head, "" if source is None else source.trouble),
+            "last_sample": None if head is None else iso(head / 1e9),
+            "channels": {seed_id: iso(end / 1e9) for seed_id, end in sorted(self.buffer.newest.items())},
+            "packets": dict(self.buffer.counts),
+            "source_counts": {} if source is None else dict(source.counts),
+            "notes": self.buffer.report.notes[-20:],
+            "left_aside": dict(list(self.buffer.report.left_aside.items())[:20]),
+            "live": dict(zip(LIVE_COLUMNS, live[0], strict=True)) if live else None,
+            "tracks": tracks,
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale, 1),
+        }
+
+
+class Health:
+    """What a station remembers of its last hour, to say whether it is well."""
+
+    def __init__(self, silence_s: float) -> None:
+        self.trouble = ""
+        self._silence_s = silence_s
+        self._heard: float | None = None
+        self._heard_wall: float | None = None
+        self._began = time.monotonic()
+        self._coverage: deque[float] = deque(maxlen=60)
+        self.last_minute: str | None = None
+        self.minute_delay_s: float | None = None
+
+    def heard(self) -> None:
+        """A packet has come."""
+        self._heard, self._heard_wall = time.monotonic(), time.time()
+
+    def minute(self, rows: pd.DataFrame) -> None:
+        """Minutes have been said."""
+        self._coverage.extend(rows["coverage"].to_numpy(float)[-60:])
+        self.last_minute = str(rows["time"].iloc[-1])
+        if self._heard is not None:
+            self.minute_delay_s = time.monotonic() - self._heard
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the last packet, or since the start."""
+        return time.monotonic() - (self._began if self._heard is None else self._heard)
+
+    def said(self, head_ns: int | None, source_trouble: str) -> dict[str, Any]:
+        """Health in plain values; `trouble` is empty while all is well."""
+        silent = self.silent_s > self._silence_s
+        trouble = self.trouble or source_trouble or (f"no packet for {self.silent_s:.0f} s" if silent else "")
+        return {
+            "healthy": not trouble,
+            "trouble": trouble,
+            "last_packet": None if self._heard_wall is None else iso(round(self._heard_wall)),
+            "silent_s": round(self.silent_s, 1),
+            "data_latency_s": None if head_ns is None else round(time.time() - head_ns / 1e9, 1),
+            "last_minute": self.last_minute,
+            "minute_delay_s": None if self.minute_delay_s is None else round(self.minute_delay_s, 3),
+            "coverage_last_hour": round(float(np.mean(self._coverage)), 3) if self._coverage else None,
+        }

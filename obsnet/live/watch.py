@@ -1,0 +1,83 @@
+"""A whole watch: source, station and outputs put together, run until a signal or the end of the source."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from obsnet.live.config import WatchConfig
+from obsnet.live.sources import open_source
+from obsnet.live.station import LiveStation
+from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.output import prepare_folder
+from obsnet.signals.station import Station
+
+
+def watch_source(
+    source: str,
+    station: Station,
+    config: WatchConfig,
+    out: Path,
+    *,
+    once: bool = False,
+    check: bool = False,
+    amplitudes: Amplitudes | None = None,
+    table: Any = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Keep a folder up to date with what a source sends, until it ends or the process is told to.
+
+    Parameters
+    ----------
+    source : seedlink://HOST:PORT/NET.STA, a folder, or - for miniSEED on standard input.
+    station, config : Station, WatchConfig
+    out : folder of obsnet.sqlite and the files made from it.
+    once : end when a folder or standard input has nothing more, the record closed.
+    check : only make sure that everything is there and fits.
+    amplitudes, table : as for `Pipeline`.
+    say : called with a line for people when something happens.
+
+    Raises
+    ------
+    ObsnetError : source, station, configuration or folder cannot serve.
+    """
+    if check:
+        from obsnet.pipeline import Pipeline
+
+        prepare_folder(out)
+        open_source(source, station, config.live, {}, None, once)
+        Pipeline(station, config, amplitudes, table, config.live.threads).state()
+        say(f"{station.code}: configuration, station, detector, source and output folder are in order")
+        return
+    live = LiveStation(station, config, out, amplitudes, table, say)
+    try:
+        with stopping(live.stopping):
+            found = open_source(source, station, config.live, live.resume, live.buffer.floor_ns, once)
+            live.run(found, once)
+    finally:
+        live.close()
+
+
+@contextmanager
+def stopping(wish: threading.Event) -> Iterator[None]:
+    """Turn the first SIGINT or SIGTERM into a wish to end in good order; the second acts as it did before."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def heard(number: int, frame: object) -> None:
+        signal.signal(number, before[number])
+        wish.set()
+
+    before: dict[int, Any] = {}
+    for number in (int(signal.SIGINT), int(signal.SIGTERM)):
+        before[number] = signal.signal(number, heard)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
