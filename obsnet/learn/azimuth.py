@@ -1,0 +1,198 @@
+"""The azimuth detector's examples, loss and calibration: prepared records in, a calibrated network out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from obsnet.detectors.azimuth_features import cell_index
+from obsnet.errors import ConfigError
+from obsnet.learn.dataset import NO_PHASOR, PreparedSet, Record
+
+ROW_MINUTES = 10
+ROW_CELLS = 3 * (ROW_MINUTES + 2)
+ABSENT, HERE, UNKNOWN = 0, 1, 2
+Batch = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class AzimuthTaskConfig:
+    """Labels and augmentation.
+
+    Parameters
+    ----------
+    reach_m : ships within this range are to be found; those beyond, and those whose place AIS does not tell, are unknown.
+    beside_deg : half-width of the sector about an unknown or another ship that says nothing.
+    prior_odds : odds of a ship against none in the training draws; only their removal from the output matters.
+    forget_share : share of rows whose slow memory (level, background) is taken away, as after a station's start.
+    """
+
+    reach_m: float = 60e3
+    beside_deg: float = 20.0
+    prior_odds: float = 1.0
+    forget_share: float = 0.15
+
+
+class AzimuthRows(Dataset):
+    """Rows of ten minutes of prepared records, in memory.
+
+    A row holds invariants (cell, channel, frequency), phasor (2, cell, frequency), doubled (), turn (minute, ship) in parts
+    of the circle (of the doubled one where `doubled`), state (minute, ship) of `ABSENT`, `HERE`, `UNKNOWN`, and weight
+    (minute), 0 where a minute says nothing.
+    """
+
+    def __init__(
+        self,
+        prepared: PreparedSet,
+        split: str,
+        config: AzimuthTaskConfig = AzimuthTaskConfig(),
+        ships: int = 4,
+    ) -> None:
+        self.config = config
+        only = ("cell_index", "invariants", "phasor", "minute", "azimuth_deg", "range_m", "known")
+        self._records: list[Record] = []
+        self._labels: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.rows: list[tuple[int, int]] = []
+        for record in prepared.records(split, only):
+            if not len(record.cell_index):
+                continue
+            number = len(self._records)
+            self._records.append(record)
+            self._labels.append(_labels(record, config, ships))
+            self.rows += [(number, row) for row in range(len(record.minute) // ROW_MINUTES)]
+        if not self.rows:
+            raise ConfigError(
+                f"{prepared.folder} holds no {split} record with both horizontals; prepare more records"
+            )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, item: int) -> Batch:
+        number, row = self.rows[item]
+        record = self._records[number]
+        minutes = slice(ROW_MINUTES * row, ROW_MINUTES * (row + 1))
+        first = int(cell_index(record.minute[minutes.start] - 90.0))
+        low = first - int(record.cell_index[0])
+        inside = slice(max(low, 0), max(low + ROW_CELLS, 0))
+        angle, invariants = record.phasor[inside], record.invariants[inside]
+        pad = (max(-low, 0), ROW_CELLS - len(angle) - max(-low, 0))
+        turned = np.pi / 32767.0 * angle.astype(np.float32)
+        unit = np.stack([np.cos(turned), np.sin(turned)]) * (angle != NO_PHASOR)
+        turn, state, weight = (labels[minutes] for labels in self._labels[number])
+        return {
+            "invariants": torch.from_numpy(np.pad(invariants, (pad, (0, 0), (0, 0))).astype(np.float32)),
+            "phasor": torch.from_numpy(np.pad(unit, ((0, 0), pad, (0, 0))).astype(np.float32)),
+            "doubled": torch.tensor(float(record.attributes["ambiguity_deg"] == 180)),
+            "turn": torch.from_numpy(turn),
+            "state": torch.from_numpy(state),
+            "weight": torch.from_numpy(weight),
+        }
+
+    def seen(self, item: int) -> tuple[np.ndarray, np.ndarray]:
+        """Whether a ship is within reach, and weight, of each minute of a row."""
+        number, row = self.rows[item]
+        minutes = slice(ROW_MINUTES * row, ROW_MINUTES * (row + 1))
+        _, state, weight = (labels[minutes] for labels in self._labels[number])
+        return (state == HERE).any(axis=1), weight
+
+
+def _labels(
+    record: Record, config: AzimuthTaskConfig, ships: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turn, state (minute, ship) and weight (minute) of a record; the nearest ships, padded."""
+    order = np.argsort(np.nan_to_num(record.range_m, nan=np.inf), axis=1)[:, :ships]
+    azimuth, distance, known = (
+        np.take_along_axis(values, order, axis=1)
+        for values in (record.azimuth_deg, record.range_m, record.known)
+    )
+    placed = np.isfinite(azimuth)
+    state = np.where(placed & known & (distance <= config.reach_m), HERE, ABSENT)
+    state = np.where(placed & (state != HERE), UNKNOWN, state)
+    lost = (~known & ~placed).any(axis=1)
+    here = (state == HERE).any(axis=1)
+    weight = (~lost & (here | record.absence_known)).astype(np.float32)
+    fold = 360.0 / float(record.attributes["ambiguity_deg"])
+    turn = np.nan_to_num(azimuth * fold / 360.0).astype(np.float32) % 1.0
+    missing = ((0, 0), (0, ships - turn.shape[1]))
+    return np.pad(turn, missing), np.pad(state, missing).astype(np.int64), weight
+
+
+def augmented(batch: Batch, generator: torch.Generator, config: AzimuthTaskConfig) -> Batch:
+    """Rows turned, mirrored and, some of them, robbed of their memory: none changes what they should say."""
+    rows = batch["turn"].shape[0]
+    turn = torch.rand(rows, generator=generator)
+    mirrored = torch.rand(rows, generator=generator) < 0.5
+    forgets = torch.rand(rows, generator=generator) < config.forget_share
+    sign = torch.where(mirrored, -1.0, 1.0)[:, None, None]
+    real, imag = batch["phasor"][:, 0], batch["phasor"][:, 1] * sign
+    angle = 2 * np.pi * turn[:, None, None]
+    phasor = torch.stack(
+        [
+            real * torch.cos(angle) - imag * torch.sin(angle),
+            real * torch.sin(angle) + imag * torch.cos(angle),
+        ],
+        1,
+    )
+    keep = torch.ones(1, 1, batch["invariants"].shape[2], 1)
+    keep[0, 0, [0, 10, 11]] = 0.0
+    invariants = torch.where(forgets[:, None, None, None], batch["invariants"] * keep, batch["invariants"])
+    turned = (batch["turn"] * sign + turn[:, None, None]) % 1.0
+    return batch | {"phasor": phasor, "invariants": invariants, "turn": turned}
+
+
+def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Tensor:
+    """Negative log posterior of what is there, per minute (row, minute).
+
+    With a ship at θ: −log(π(θ) e^{l(θ)} / (1 + Σ π e^l)), with none: −log(1 / (1 + Σ π e^l)), π the prior of an azimuth over
+    that of no ship. Where several ships are there each is asked for alone, without the sectors of the others; the sectors of
+    ships beyond reach say nothing. At its minimum l is the log-likelihood ratio, the prior of the training draws removed.
+    """
+    count = ratio.shape[-1]
+    log_prior = float(np.log(config.prior_odds / count))
+    centre = torch.arange(count, dtype=ratio.dtype) / count
+    apart = (batch["turn"][..., None] - centre + 0.5) % 1.0 - 0.5
+    beside = apart.abs() < config.beside_deg / 360.0 * (1.0 + batch["doubled"][:, None, None, None])
+    here, unknown = batch["state"] == HERE, batch["state"] == UNKNOWN
+    silent = (beside & unknown[..., None]).any(2)
+    own = apart.abs() < 1.5 / count
+    # The others' sectors, except the ship's own cells.
+    others = torch.stack(
+        [
+            (beside & here[..., None])[:, :, [j for j in range(here.shape[2]) if j != i]].any(2)
+            for i in range(here.shape[2])
+        ],
+        2,
+    )
+    closed = (others | silent[:, :, None]) & ~own
+    scores = ratio + log_prior
+    evidence = torch.nn.functional.softplus(_logsumexp(scores[:, :, None].masked_fill(closed, -torch.inf)))
+    nothing = torch.nn.functional.softplus(_logsumexp(scores.masked_fill(silent, -torch.inf)))
+    asked = evidence - at_turn(scores, batch["turn"])
+    number = here.sum(2)
+    with_ship = (asked * here).sum(2) / number.clamp(min=1)
+    return torch.where(number > 0, with_ship, nothing)
+
+
+def _logsumexp(values: Tensor) -> Tensor:
+    return torch.logsumexp(torch.nan_to_num(values, neginf=-60.0), -1)
+
+
+def at_turn(values: Tensor, turn: Tensor) -> Tensor:
+    """Values (row, minute, azimuth) at turns (row, minute, ship), linear between the grid's azimuths."""
+    count = values.shape[-1]
+    place = (turn % 1.0) * count
+    low = place.floor()
+    share = place - low
+    first = low.long() % count
+    return values.gather(2, first) * (1 - share) + values.gather(2, (first + 1) % count) * share
+
+
+def loss(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Tensor:
+    """Mean over the minutes that say something."""
+    weight = batch["weight"]
+    return (minute_losses(ratio, batch, config) * weight).sum() / weight.sum().clamp(min=1.0)

@@ -1,0 +1,161 @@
+"""The azimuth network's training and fine-tuning: a prepared set in, ``weights.pt`` with calibration and provenance out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from obsnet.config import build
+from obsnet.detectors.azimuth_features import FeatureConfig
+from obsnet.errors import ConfigError
+from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig, Batch, augmented, loss
+from obsnet.learn.calibration import Calibration, apply, calibrate, metrics, outputs
+from obsnet.learn.dataset import PreparedSet
+from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters
+from obsnet.learn.prepare import provenance
+from obsnet.learn.task import TrainerConfig, fit, load_weights, save_weights, seeded
+
+WEIGHTS = "weights.pt"
+
+
+class AzimuthProblem:
+    """The azimuth network with its loss."""
+
+    def __init__(self, network: AzimuthNetwork, config: AzimuthTaskConfig) -> None:
+        self.network: torch.nn.Module = network
+        self.config = config
+
+    def loss(self, batch: Batch, training: bool, generator: torch.Generator) -> Tensor:
+        """Mean loss of a batch, augmented in training."""
+        batch = augmented(batch, generator, self.config) if training else batch
+        ratio = self.network(batch["invariants"], batch["phasor"], batch["doubled"])
+        return loss(ratio, batch, self.config)
+
+
+def train(
+    prepared: PreparedSet,
+    folder: str | Path,
+    network: AzimuthNetworkConfig = AzimuthNetworkConfig(),
+    labels: AzimuthTaskConfig = AzimuthTaskConfig(),
+    trainer: TrainerConfig = TrainerConfig(),
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Train, calibrate on validation, measure on test; ``weights.pt`` and ``metrics.json``'s content come back.
+
+    Parameters
+    ----------
+    folder : of the run. about : anything to keep with the weights, for instance the composed configuration.
+    """
+    rows = AzimuthRows(prepared, "train", labels)
+    check = AzimuthRows(prepared, "validation", labels)
+    labels = replace(labels, prior_odds=prior_odds(rows))
+    network = replace(network, frequencies=rows[0]["phasor"].shape[-1])
+    made = seeded(trainer.seed, lambda: AzimuthNetwork(network))
+    assert isinstance(made, AzimuthNetwork)
+    say(f"{len(rows)} rows to train on, {len(check)} to validate, {parameters(made)} parameters")
+    fit(AzimuthProblem(made, labels), rows, check, folder, trainer)
+    return _finish(made, prepared, folder, labels, trainer, about, say)
+
+
+def finetune(
+    prepared: PreparedSet,
+    folder: str | Path,
+    weights: str | Path,
+    labels: AzimuthTaskConfig = AzimuthTaskConfig(),
+    trainer: TrainerConfig = TrainerConfig(epochs=8, learning_rate=5e-4),
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Adapt trained weights to a station; the old ones are kept where the new are not better on held-out passages.
+
+    The held-out passages are the validation split's. The old calibration stays: what AIS does not show is unknown at a real
+    station, and a handful of passages says nothing of the sea without ships.
+    """
+    made, calibration, before = restored(weights)
+    labels = replace(labels, prior_odds=calibration.prior_odds)
+    rows = AzimuthRows(prepared, "train", labels)
+    check = AzimuthRows(prepared, "validation", labels)
+    old = {name: values.clone() for name, values in made.state_dict().items()}
+    loss_before = held_out_loss(made, check, calibration, labels)
+    fit(AzimuthProblem(made, labels), rows, check, folder, trainer)
+    loss_after = held_out_loss(made, check, calibration, labels)
+    better = loss_after < loss_before
+    if not better:
+        made.load_state_dict(old)
+    verdict = "kept the new weights" if better else "kept the old weights"
+    say(f"held-out passages: {loss_before:.4f} nats a minute before, {loss_after:.4f} after; {verdict}")
+    found = {"loss_before": loss_before, "loss_after": loss_after, "adapted": float(better)}
+    told = before | {
+        "finetune": {"set": provenance(labels), "data_digest": prepared.digest(), **found, **(about or {})}
+    }
+    save_weights(Path(folder) / WEIGHTS, made, told)
+    return found
+
+
+def held_out_loss(
+    network: AzimuthNetwork, rows: AzimuthRows, calibration: Calibration, labels: AzimuthTaskConfig
+) -> float:
+    """Loss per minute of calibrated ratios."""
+    said = outputs(network, rows)
+    return float(loss(apply(said, calibration), said.batch, labels))
+
+
+def restored(path: str | Path) -> tuple[AzimuthNetwork, Calibration, dict[str, Any]]:
+    """Network, calibration and description of a run's ``weights.pt``."""
+    state, about = load_weights(path)
+    network = AzimuthNetwork(build(AzimuthNetworkConfig, about["network"]))
+    network.load_state_dict(state)
+    return network, build(Calibration, about["calibration"]), about
+
+
+def prior_odds(rows: AzimuthRows) -> float:
+    """Minutes with a ship over minutes without one, of those that say something."""
+    said = with_ship = 0.0
+    for item in range(len(rows)):
+        here, weight = rows.seen(item)
+        said += float(weight.sum())
+        with_ship += float((weight * here).sum())
+    if not 0 < with_ship < said:
+        raise ConfigError("training needs minutes with a ship and minutes without one; prepare more records")
+    return with_ship / (said - with_ship)
+
+
+def _finish(
+    network: AzimuthNetwork,
+    prepared: PreparedSet,
+    folder: str | Path,
+    labels: AzimuthTaskConfig,
+    trainer: TrainerConfig,
+    about: dict[str, Any] | None,
+    say: Callable[[str], None],
+) -> dict[str, float]:
+    said = outputs(network, AzimuthRows(prepared, "validation", labels))
+    calibration = calibrate(said, labels)
+    found = {f"validation_{k}": v for k, v in metrics(apply(said, calibration), said, labels).items()}
+    try:
+        tested = outputs(network, AzimuthRows(prepared, "test", labels))
+        found |= {f"test_{k}": v for k, v in metrics(apply(tested, calibration), tested, labels).items()}
+    except ConfigError:
+        say("the prepared set holds no test records")
+    description = {
+        "task": "azimuth",
+        "network": asdict(network.config),
+        "labels": asdict(labels),
+        "trainer": asdict(trainer),
+        "features": asdict(FeatureConfig()),
+        "calibration": calibration.to_dict(),
+        "metrics": found,
+        "data_digest": prepared.digest(),
+        "made": provenance(trainer),
+        **(about or {}),
+    }
+    save_weights(Path(folder) / WEIGHTS, network, description)
+    for name, value in found.items():
+        say(f"{name} {value:.4g}")
+    return found

@@ -1,0 +1,93 @@
+"""What the scripts of `train/` and `export/` do with a composed configuration."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from obsnet.config import build
+from obsnet.console import progress, say
+from obsnet.errors import ConfigError, ObsnetError
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A composed configuration, interpolations resolved, as plain containers."""
+    made = OmegaConf.to_container(config, resolve=True)
+    return {str(key): value for key, value in made.items()} if isinstance(made, dict) else {}
+
+
+def speaking(command: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """Turn bad input into one line and exit status 2."""
+
+    @functools.wraps(command)
+    def run(config: DictConfig) -> Any:
+        try:
+            return command(config)
+        except ObsnetError as error:
+            print(f"obsnet: error: {' '.join(str(error).split())}", file=sys.stderr)
+            sys.exit(2)
+
+    return run
+
+
+def prepare_records(config: DictConfig) -> None:
+    """Prepare the records of ``config.data`` into ``config.out``."""
+    from obsnet.learn.prepare import ArchiveData, TwinData, prepare
+
+    values = plain(config)
+    data = dict(values["data"])
+    kinds = {"twin": TwinData, "archive": ArchiveData}
+    kind = data.pop("kind", None)
+    if kind not in kinds:
+        raise ConfigError(f"data.kind must be one of {', '.join(kinds)}, found {kind!r}")
+    with progress("prepare", quiet=False) as draw:
+        made = prepare(values["out"], build(kinds[kind], data, "data"), draw)
+    say(f"{len(made.names())} records in {made.folder}")
+
+
+def train_detector(config: DictConfig) -> float:
+    """Train (or, with ``config.weights``, adapt) the detector that ``config.task`` names; returns its validation loss."""
+    from pathlib import Path
+
+    from obsnet.learn.dataset import PreparedSet
+    from obsnet.learn.task import TrainerConfig
+
+    values = plain(config)
+    prepared, folder = PreparedSet(values["prepared"]), Path(values["out"])
+    trainer = build(TrainerConfig, values["trainer"], "trainer")
+    about = {"resolved": values}
+    if values["task"] == "azimuth":
+        from obsnet.learn import azimuth_training as training
+        from obsnet.learn.azimuth import AzimuthTaskConfig
+        from obsnet.learn.networks import AzimuthNetworkConfig
+
+        labels = build(AzimuthTaskConfig, values["labels"], "labels")
+        if values.get("weights"):
+            found = training.finetune(prepared, folder, values["weights"], labels, trainer, about, say)
+            return min(found["loss_before"], found["loss_after"])
+        network = build(AzimuthNetworkConfig, values["network"], "network")
+        return training.train(prepared, folder, network, labels, trainer, about, say)["validation_nll"]
+    raise ConfigError(f"task must be azimuth, found {values['task']!r}")
+
+
+def export_detector(config: DictConfig) -> None:
+    """Write the ONNX file of ``config.weights`` to ``config.out`` and check it."""
+    from obsnet.learn.export import export, parity
+
+    values = plain(config)
+    path = export(values["weights"], values["out"])
+    worst = parity(values["weights"], path, values["prepared"])
+    say(f"{path}: {path.stat().st_size} bytes, differs from PyTorch by {worst:.1e} at most")
+
+
+def verify_export(config: DictConfig) -> None:
+    """Check the ONNX file of ``config.out`` against ``config.weights`` on real maps."""
+    from obsnet.learn.export import parity
+
+    values = plain(config)
+    worst = parity(values["weights"], values["out"], values["prepared"])
+    say(f"{values['out']}: differs from PyTorch by {worst:.1e} at most")

@@ -1,0 +1,170 @@
+"""Training of a detector: a network, its examples and its loss in, weights with their provenance out."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from obsnet.errors import ConfigError, ModelError
+from obsnet.output import prepare_folder
+
+Batch = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class TrainerConfig:
+    """How to train.
+
+    Parameters
+    ----------
+    epochs, batch, learning_rate, weight_decay : of AdamW under a one-cycle schedule.
+    patience : epochs without a better validation loss after which training stops.
+    seed : of weights, order and augmentation. threads : of torch; 1 gives the same numbers anywhere.
+    max_minutes : training ends after so long.
+    """
+
+    epochs: int = 14
+    batch: int = 16
+    learning_rate: float = 4e-3
+    weight_decay: float = 1e-4
+    patience: int = 5
+    seed: int = 0
+    threads: int = 1
+    max_minutes: float = 40.0
+
+
+class Problem(Protocol):
+    """What differs between the detectors."""
+
+    @property
+    def network(self) -> nn.Module:
+        """What is trained."""
+        ...
+
+    def loss(self, batch: Batch, training: bool, generator: torch.Generator) -> Tensor:
+        """Mean loss of a batch."""
+        ...
+
+
+class DetectorTask(lightning.LightningModule):
+    """Lightning's view of a `Problem`."""
+
+    def __init__(self, problem: Problem, config: TrainerConfig, steps: int) -> None:
+        super().__init__()
+        self.problem, self.config, self._steps = problem, config, steps
+        self.network = problem.network
+        self._generator = torch.Generator().manual_seed(config.seed)
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        """One batch."""
+        value = self.problem.loss(batch, True, self._generator)
+        self.log(
+            "loss",
+            value,
+            prog_bar=True,
+            on_step=False,
+            on_epoch=True,
+            batch_size=len(next(iter(batch.values()))),
+        )
+        return value
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        """One batch."""
+        value = self.problem.loss(batch, False, self._generator)
+        self.log("validation_loss", value, prog_bar=True, batch_size=len(next(iter(batch.values()))))
+
+    def configure_optimizers(self) -> Any:
+        """AdamW, one cycle."""
+        config = self.config
+        optimiser = torch.optim.AdamW(
+            self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, config.learning_rate, total_steps=self._steps, pct_start=0.15
+        )
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def fit(
+    problem: Problem,
+    train: Dataset,
+    validation: Dataset,
+    folder: str | Path,
+    config: TrainerConfig,
+    progress: bool = True,
+) -> float:
+    """Train a problem's network; the best weights by validation stay in it.
+
+    Parameters
+    ----------
+    folder : of checkpoints and ``metrics.csv``; training goes on from ``last.ckpt`` where there is one.
+
+    Returns
+    -------
+    The best validation loss.
+    """
+    folder = prepare_folder(folder)
+    torch.set_num_threads(config.threads)
+    order = torch.Generator().manual_seed(config.seed + 1)
+    loader = DataLoader(train, config.batch, shuffle=True, generator=order)
+    check = DataLoader(validation, config.batch)
+    task = DetectorTask(problem, config, max(len(loader), 1) * config.epochs)
+    best = ModelCheckpoint(
+        folder, "best", monitor="validation_loss", save_last=True, enable_version_counter=False
+    )
+    trainer = lightning.Trainer(
+        accelerator="cpu", devices=1, max_epochs=config.epochs, deterministic=True,
+        max_time={"seconds": round(60 * config.max_minutes)}, gradient_clip_val=1.0, log_every_n_steps=10,
+        logger=CSVLogger(folder, name="", version=""), enable_progress_bar=progress, enable_model_summary=False,
+        callbacks=[best, EarlyStopping("validation_loss", patience=config.patience)],
+        num_sanity_val_steps=0,
+    )  # fmt: skip
+    last = folder / "last.ckpt"
+    trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
+    if not best.best_model_path:
+        raise ConfigError("training ended before the first epoch; give it more minutes")
+    state = torch.load(best.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
+    task.load_state_dict(state)
+    assert best.best_model_score is not None
+    return float(best.best_model_score)
+
+
+def save_weights(path: str | Path, network: nn.Module, about: dict[str, Any]) -> None:
+    """Weights and what is known about them, in a file that loads with ``weights_only=True``; whole or not at all."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    torch.save({"state": network.state_dict(), "about": json.dumps(about, default=str)}, partial)
+    os.replace(partial, path)
+
+
+def load_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """State and description from `save_weights`.
+
+    Raises
+    ------
+    ModelError : the file is missing or not of ours.
+    """
+    try:
+        held = torch.load(path, map_location="cpu", weights_only=True)
+        return held["state"], json.loads(held["about"])
+    except FileNotFoundError:
+        raise ModelError(f"there are no weights at {path}; run train/train.py first") from None
+    except Exception as error:  # torch raises whatever its unpickler met
+        raise ModelError(f"{path} holds no weights of obsnet: {str(error).splitlines()[0][:120]}") from None
+
+
+def seeded(seed: int, make: Callable[[], nn.Module]) -> nn.Module:
+    """A network whose first weights depend on the seed alone."""
+    torch.manual_seed(seed)
+    return make()
