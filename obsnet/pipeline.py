@@ -21,9 +21,11 @@ from obsnet.detectors.analytic import (
     AzimuthDetectorConfig,
     RangeDetectorConfig,
 )
+from obsnet.detectors.azimuth_features import LOOK_AHEAD_S
 from obsnet.detectors.background import BackgroundDirection
-from obsnet.detectors.maps import LikelihoodMaps, detections, presence
-from obsnet.errors import ConfigError, ModelError
+from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, presence, window_bounds
+from obsnet.detectors.model_card import shipped
+from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table
@@ -36,6 +38,7 @@ from obsnet.trackers.grid_search import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
 
 if TYPE_CHECKING:
+    from obsnet.detectors.learned import LearnedAzimuthDetector
     from obsnet.trackers.station_focalization import StationFocalization, StationScans
 
 LONG_SILENCE_S = 86400.0
@@ -43,16 +46,28 @@ LONG_SILENCE_S = 86400.0
 
 
 @dataclass(frozen=True)
-class RunConfig:
-    """Parameters of a whole run, one section per stage; the YAML of ``--config`` mirrors it."""
+class ModelsConfig:
+    """ONNX files of the learned detectors, for those that are not the shipped ones."""
 
-    detector: Literal["learned", "analytic"] = "analytic"
+    azimuth: str | None = None
+    range: str | None = None
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Parameters of a whole run, one section per stage; the YAML of ``--config`` mirrors it.
+
+    `detector` may also be learned in azimuth or in range alone, for comparisons.
+    """
+
+    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] = "analytic"
     tracker: Literal["grid", "bernoulli", "focalization"] = "grid"
     spectra: SpectraConfig = field(default_factory=SpectraConfig)
     azigram: AzigramConfig = field(default_factory=AzigramConfig)
     cepstrogram: CepstrogramConfig = field(default_factory=CepstrogramConfig)
     azimuth: AzimuthDetectorConfig = field(default_factory=AzimuthDetectorConfig)
     range: RangeDetectorConfig = field(default_factory=RangeDetectorConfig)
+    models: ModelsConfig = field(default_factory=ModelsConfig)
     ocean: OceanConfig = field(default_factory=OceanConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     grid_search: GridSearchConfig = field(default_factory=GridSearchConfig)
@@ -97,13 +112,14 @@ class Pipeline:
         table: xr.Dataset | None = None,
         threads: int | None = None,
     ) -> None:
-        if config.detector == "learned":
-            raise ModelError("no learned detector is shipped with this obsnet; use --detector analytic")
         self.station, self.config = station, config
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         amplitudes = amplitudes or Amplitudes.default().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
-        self._range = AnalyticRangeDetector(self.table, amplitudes, config.range, threads)
+        self._learned = (
+            _learned_azimuth(config) if config.detector in ("learned", "learned-azimuth") else None
+        )
+        self._range = _range_detector(config, self.table, amplitudes, threads)
         self._clutter = ClutterFilter(config.cepstrogram)
         self._background = BackgroundDirection(
             config.azimuth.background_window_s, config.azimuth.background_step_s
@@ -126,13 +142,15 @@ class Pipeline:
         if self._last is not None and times[0] - self._last > LONG_SILENCE_S:
             finished.append(self.flush())
             self._azigram = self._null = self._cepstrogram = self._spectrogram = self._next = None
+            if self._learned is not None:
+                self._learned.reset()
         if self._next is None:
             self._next = float(np.ceil(times[0] / self.config.azimuth.step_s) * self.config.azimuth.step_s)
         self._take(spectra)
         self._last = float(times[-1])
-        finished.append(
-            self._finish(times[-1] + self.config.spectra.hop_s - self.config.azimuth.window_s / 2)
-        )
+        ready = times[-1] - self.config.azimuth.window_s / 2
+        looks = self._learned is not None and self._azigram is not None
+        finished.append(self._finish(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s))
         return [minutes for minutes in finished if minutes is not None]
 
     def flush(self) -> Minutes | None:
@@ -140,6 +158,8 @@ class Pipeline:
         held = self._spectrogram
         if held is None or not held.sizes["time"]:
             return None
+        if self._learned is not None:
+            self._learned.finish()
         return self._finish(float(to_posix(held["time"].values[-1])))
 
     def followed(self) -> pd.DataFrame:
@@ -198,7 +218,8 @@ class Pipeline:
 
     def _stages(self) -> dict[str, Any]:
         """The stages that remember something between blocks."""
-        return {"clutter": self._clutter, "background": self._background}
+        stages = {"clutter": self._clutter, "background": self._background}
+        return stages if self._learned is None else stages | {"learned": self._learned}
 
     def _held(self) -> dict[str, xr.DataArray | None]:
         return {
@@ -210,7 +231,10 @@ class Pipeline:
     def _take(self, spectra: xr.Dataset) -> None:
         if "east" in spectra and "north" in spectra:
             azimuths = azigram(spectra, self.config.azigram)
-            null = self._background(azimuths) if self.config.azimuth.null == "directional" else None
+            directional = self._learned is None and self.config.azimuth.null == "directional"
+            null = self._background(azimuths) if directional else None
+            if self._learned is not None:
+                self._learned.take(spectra)
             self._null = null if self._null is None else _join(self._null, null)
             self._azigram = _concat(self._azigram, azimuths)
         if "p" in spectra:
@@ -229,7 +253,7 @@ class Pipeline:
         minutes = self._next + step * np.arange(count)
         parts = []
         if self._azigram is not None:
-            parts.append(self._azimuth.maps(self._azigram, minutes, self._null))
+            parts.append(self._azimuth_maps(self._azigram, minutes))
         if self._cepstrogram is not None:
             parts.append(self._range.maps(self._cepstrogram, minutes))
         if not parts:
@@ -239,14 +263,19 @@ class Pipeline:
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
         ratios = presence(maps)
-        features = self._features(minutes)
-        for name in ("approaching", "leaving"):
-            if name in ratios:
-                features[f"{name}_llr"] = ("time", ratios[name].to_numpy(np.float32), {"units": "1"})
-        result = Minutes(maps, detections(maps, ratios), ratios, features)
+        result = Minutes(maps, detections(maps, ratios), ratios, self._features(minutes))
         self._next = float(minutes[-1] + step)
         self._forget(self._next - self.config.azimuth.window_s / 2)
         return result
+
+    def _azimuth_maps(self, held: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
+        if self._learned is None:
+            return self._azimuth.maps(held, minutes, self._null)
+        window_s, times = self.config.azimuth.window_s, to_posix(held["time"].values)
+        bounds = window_bounds(times, minutes, window_s)
+        heard = ~np.isnan(held.values).all(axis=0)
+        covered = coverage(heard, *bounds, minutes, window_s, self.config.spectra.hop_s)
+        return self._learned.maps(minutes, covered)
 
     def _features(self, minutes: np.ndarray) -> xr.Dataset:
         """Spectrogram, azigram and cepstrogram thinned to one column a minute, for the eye."""
@@ -262,6 +291,8 @@ class Pipeline:
         return xr.Dataset(features).assign_coords(time=from_posix(minutes))
 
     def _forget(self, before: float) -> None:
+        if self._learned is not None:
+            self._learned.forget(before)
         if self._azigram is not None:
             keep = to_posix(self._azigram["time"].values) >= before
             self._azigram = self._azigram[:, keep]
@@ -293,6 +324,20 @@ def _taken_up(arrays: Mapping[str, np.ndarray]) -> xr.DataArray | None:
 
 def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
+
+
+def _learned_azimuth(config: RunConfig) -> LearnedAzimuthDetector:
+    from obsnet.detectors.learned import LearnedAzimuthDetector
+
+    return LearnedAzimuthDetector(config.azimuth, config.spectra, config.models.azimuth)
+
+
+def _range_detector(
+    config: RunConfig, table: xr.Dataset, amplitudes: Amplitudes, threads: int | None
+) -> AnalyticRangeDetector:
+    if config.detector in ("learned", "learned-range"):
+        shipped("range")
+    return AnalyticRangeDetector(table, amplitudes, config.range, threads)
 
 
 def _follower(table: xr.Dataset, amplitudes: Amplitudes) -> StationFocalization:

@@ -180,7 +180,10 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
         (["--end", "2012-01-01"], "no waveforms before 2012-01-01"),
         (["--end", "2013-05-21T10:00:10Z"], "no whole frame"),
         (["--end", "2013-05-21T10:00:50Z"], "no minute of XX.SIM01"),
-        (["--detector", "magic"], "detector must be one of learned, analytic, found 'magic'"),
+        (
+            ["--detector", "magic"],
+            "detector must be one of learned, analytic, learned-azimuth, learned-range, found 'magic'",
+        ),
         (["--tracker", "magic"], "tracker must be one of grid, bernoulli, focalization, found 'magic'"),
         (["--jobs", "0"], "--jobs"),
         (["--calibration", "none.yaml"], "cannot read the configuration none.yaml"),
@@ -242,11 +245,11 @@ def test_overrides_that_do_not_serve(refused, override, found):
     assert found in refused("--set", override)
 
 
-def test_the_learned_detector_is_not_there(refused, tmp_path):
-    wanted = "no learned detector is shipped with this obsnet; use --detector analytic"
-    assert wanted in refused("--detector", "learned")
-    assert wanted in refused("--config", write(tmp_path / "c.yaml", "detector: learned"))
-    assert wanted in refused("--set", "detector=learned", command="detect")
+def test_a_model_that_is_none_is_refused(refused, tmp_path):
+    junk = write(tmp_path / "junk.onnx", "no model")
+    assert "is no ONNX model" in refused("--detector", "learned-azimuth", "--set", f"models.azimuth={junk}")
+    absent = refused("--detector", "learned-azimuth", "--set", f"models.azimuth={tmp_path}/none.onnx")
+    assert "cannot read the model" in absent
 
 
 @pytest.mark.parametrize(
