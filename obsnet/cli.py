@@ -201,10 +201,26 @@ def detect(
 def evaluate(
     folder: Annotated[Path, typer.Argument(help="Folder of `obsnet track`.")],
     ais: Annotated[Path, typer.Option("--ais", help="AIS file.")],
+    max_cpa: Annotated[
+        float, typer.Option("--max-cpa", help="Ships that come no closer [km] need not be found.")
+    ] = 25.0,
+    max_range: Annotated[
+        float, typer.Option("--max-range", help="Ships are followed to this range [km].")
+    ] = 100.0,
+    merchant_only: Annotated[
+        bool, typer.Option("--merchant-only", help="Cargo ships and tankers alone.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the core paper's Table I for a run, against AIS."""
-    commands.evaluate(folder, ais, as_json=as_json)
+    commands.evaluate(
+        folder,
+        ais,
+        as_json=as_json,
+        max_cpa_m=1e3 * max_cpa,
+        max_range_m=1e3 * max_range,
+        merchant_only=merchant_only,
+    )
 
 
 @app.command()
@@ -227,7 +243,7 @@ def calibrate(
 
     settings = commands.run_config(config, overrides, None, None)
     where = commands.read_station(station, code, start, depth_m=depth)
-    reference = commands.read_reference(ais, where)
+    reference = commands.read_reference(ais, where, max_cpa_m=None)
     with staged(out) as folder:
         with console.progress("calibrating", quiet) as progress:
             result = calibrate_waveforms(waveforms, where, reference, settings, start, end, progress)

@@ -110,11 +110,11 @@ def watch(
     )  # fmt: skip
 
 
-def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False) -> None:
-    """Say Table I of a run against AIS."""
+def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False, **limits: Any) -> None:
+    """Say Table I of a run against AIS; `limits` as `evaluate_folder` takes them."""
     from obsnet.evaluation import evaluate_folder
 
-    evaluation = evaluate_folder(folder, ais)
+    evaluation = evaluate_folder(folder, ais, **limits)
     if as_json:
         console.say(json.dumps(evaluation.to_json()))
     elif not quiet:
@@ -165,11 +165,11 @@ def read_table(path: Path | None) -> Any:
     return read_propagation(path)
 
 
-def read_reference(path: Path, station: Station) -> list:
+def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3) -> list:
     """Reference tracks of an AIS file, around the station."""
     from obsnet.ais import read, reference_tracks
 
-    return reference_tracks(read(path), station)
+    return reference_tracks(read(path), station, max_cpa_m=max_cpa_m)
 
 
 def _summary(run: Run, out: Path) -> None:

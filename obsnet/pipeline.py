@@ -263,7 +263,11 @@ class Pipeline:
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
         ratios = presence(maps)
-        result = Minutes(maps, detections(maps, ratios), ratios, self._features(minutes))
+        features = self._features(minutes)
+        for name in ("approaching", "leaving"):
+            if name in ratios:
+                features[f"{name}_llr"] = ("time", ratios[name].to_numpy(np.float32), {"units": "1"})
+        result = Minutes(maps, detections(maps, ratios), ratios, features)
         self._next = float(minutes[-1] + step)
         self._forget(self._next - self.config.azimuth.window_s / 2)
         return result

@@ -34,6 +34,7 @@ from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
+from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import Segment, Track
@@ -359,24 +360,6 @@ class _FolderSink(_MemorySink):
             writer.__exit__(*error)
 
 
-DETECTION_COLUMNS = [
-    "time",
-    "coverage",
-    "azimuth_deg",
-    "azimuth_llr",
-    "range_m",
-    "range_rate_mps",
-    "range_llr",
-]
-DETECTION_DIGITS = {
-    "coverage": 3, "azimuth_deg": 2, "azimuth_llr": 3, "range_m": 1, "range_rate_mps": 2, "range_llr": 3,
-}  # fmt: skip
-TRACK_COLUMNS = [
-    "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
-    "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
-]  # fmt: skip
-
-
 def write_tables(run: Run, folder: Path) -> None:
     """Write detections.csv, tracks.csv, tracks.geojson and run.json."""
     write_text(folder / "detections.csv", detections_csv(run.detections))
@@ -388,41 +371,6 @@ def write_tables(run: Run, folder: Path) -> None:
         live = run.live.assign(time=np.char.add(stamps, "Z"))
         write_text(folder / "live.csv", live.to_csv(index=False, float_format="%.6g"))
     write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
-
-
-def detections_csv(detections: pd.DataFrame) -> str:
-    """Text of detections.csv: ISO times, empty cells where there is no estimate."""
-    table = detections.reindex(columns=DETECTION_COLUMNS).copy()
-    stamps = table["time"].to_numpy("datetime64[s]")
-    table["time"] = np.char.add(np.datetime_as_string(stamps), "Z") if len(stamps) else table["time"]
-    return table.round(DETECTION_DIGITS).to_csv(index=False)
-
-
-def tracks_csv(rows: pd.DataFrame) -> str:
-    """Text of tracks.csv."""
-    return rows.to_csv(index=False, float_format="%.6g")
-
-
-def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
-    """Tracks as timed LineStrings in WGS 84 (a FeatureCollection, RFC 7946)."""
-    from pyproj import Proj
-
-    local = Proj(proj="aeqd", lat_0=station.latitude, lon_0=station.longitude, datum="WGS84")
-    features = []
-    for number, found in enumerate(tracks, 1):
-        if not np.isfinite(found.std[2]):
-            continue
-        times, east, north = found.positions(300.0)
-        longitude, latitude = local(east, north, inverse=True)
-        properties = {key: None if value != value else value for key, value in found.row(number).items()}
-        properties["times"] = [iso(t) for t in times]
-        properties["method"] = found.method
-        coordinates = [
-            [round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)
-        ]
-        line = {"type": "LineString", "coordinates": coordinates}
-        features.append({"type": "Feature", "geometry": line, "properties": properties})
-    return {"type": "FeatureCollection", "features": features}
 
 
 class _Clock:
@@ -515,6 +463,9 @@ def read_run(folder: str | Path) -> Run:
         ) from None
     names = {"azimuth_llr": "azimuth", "range_llr": "range"}
     ratios = found.set_index(to_posix(found["time"].to_numpy()))[list(names)].rename(columns=names)
+    for name in ("approaching", "leaving"):
+        if f"{name}_llr" in features:
+            ratios[name] = features[f"{name}_llr"].values
     ocean = config.ocean
     table = propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
     return Run(

@@ -206,6 +206,15 @@ def test_outside_any_gate_is_a_false_track_and_a_missed_ship(wrong):
     assert (result.false_tracks, result.missed) == ((1,), (1,))
 
 
+def test_ships_that_pass_far_off_may_be_found_but_are_not_missed():
+    """CPA of 10 km against a limit of 5: found it counts, unheard it has no row."""
+    limit = {"expected_cpa_m": 0.5 * abs(FIRST.cpa_range_m)}
+    unheard = evaluate(detections(), tracks(), [ship(FIRST)], delay, **limit)
+    assert (unheard.ships, unheard.missed) == ((), ())
+    found = evaluate(detections(), tracks(FIRST), [ship(FIRST)], delay, **limit)
+    assert (found.false_tracks, found.missed, found.ships[0].track) == ((), (), 1)
+
+
 def test_what_a_track_does_not_observe_is_not_held_against_it():
     table = tracks(FIRST).assign(course_deg=np.nan, cpa_azimuth_deg=np.nan)
     row = evaluate(detections(), table, [ship(FIRST)], delay).ships[0]
@@ -290,7 +299,7 @@ class TestFolder:
     @pytest.fixture
     def folder(self, tmp_path):
         from obsnet.pipeline import RunConfig
-        from obsnet.run import TRACK_COLUMNS, detections_csv
+        from obsnet.tables import TRACK_COLUMNS, detections_csv
 
         place = (-21.3732, 54.1294)
         times = T0 + np.arange(-20_000.0, 20_001, 300)

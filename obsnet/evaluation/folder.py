@@ -28,8 +28,12 @@ def evaluate_folder(
 ) -> Evaluation:
     """Score the run in a folder written by ``obsnet track`` against an AIS file.
 
-    The station and the ocean, hence the sound's travel time, are those of the folder's run.json. Parameters
-    as for `obsnet.ais.reference_tracks`.
+    The station and the ocean, hence the sound's travel time, are those of the folder's run.json.
+
+    Parameters
+    ----------
+    max_range_m, merchant_only : as for `obsnet.ais.reference_tracks`.
+    max_cpa_m : ships that come no closer need not be found; a track of such a ship is not false.
 
     Raises
     ------
@@ -49,12 +53,11 @@ def evaluate_folder(
     if not isinstance(ais, list):
         positions = read(ais, near=place, within_m=max_range_m + 400e3)
         ais = reference_tracks(
-            positions, place, max_range_m=max_range_m, max_cpa_m=max_cpa_m, merchant_only=merchant_only
+            positions, place, max_range_m=max_range_m, max_cpa_m=None, merchant_only=merchant_only
         )
     ambiguous = any("180°" in str(note) for note in notes)
-    return evaluate(
-        detections, tracks, ais, delay, DetectionCriteria(azimuth_period_deg=180.0 if ambiguous else 360.0)
-    )
+    criteria = DetectionCriteria(azimuth_period_deg=180.0 if ambiguous else 360.0)
+    return evaluate(detections, tracks, ais, delay, criteria, expected_cpa_m=max_cpa_m)
 
 
 def read_run(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:

@@ -45,6 +45,7 @@ def evaluate(
     delay: DelayFunction | None = None,
     criteria: DetectionCriteria = DetectionCriteria(),
     gates: MatchGates = MatchGates(),
+    expected_cpa_m: float | None = None,
 ) -> Evaluation:
     """Score a run against AIS.
 
@@ -58,6 +59,8 @@ def evaluate(
         The ships. Those that the station did not hear within the record are left out.
     delay : function of range [m] giving the sound's travel time [s], optional
         Detections are compared with the ships as heard through it; without it sound is taken to need no time.
+    expected_cpa_m : float, optional
+        Ships that come no closer may be found, but are not missed and have no row otherwise.
 
     Returns
     -------
@@ -77,9 +80,11 @@ def evaluate(
     lines = [track.line() for track in reference]
     compared = compare(detections, reference, delay, criteria)
     matches = match_tracks(tracks, lines, gates)
+    nearest = np.inf if expected_cpa_m is None else expected_cpa_m
     ships = tuple(
-        _ship(i, track, compared, tracks, matches.get(i), detections, delay)
+        _ship(i, track, compared, tracks, matches.get(i), detections, delay, nearest)
         for i, track in enumerate(reference)
+        if i in matches or abs(lines[i].cpa_range_m) <= nearest
     )
     numbers = tracks["track"].tolist() if "track" in tracks else list(range(1, len(tracks) + 1))
     return Evaluation(
@@ -102,6 +107,7 @@ def _ship(
     match: int | None,
     detections: pd.DataFrame,
     delay: DelayFunction | None,
+    expected_cpa_m: float,
 ) -> ShipScore:
     line = track.line()
     minutes = to_posix(detections["time"].to_numpy("datetime64[ns]"))
@@ -120,7 +126,7 @@ def _ship(
         *compared.ships[index],
         **tracker,
         interpolated=float(track.at(heard)[2].mean()) if len(heard) else float("nan"),
-        expected=bool(working >= 0.5),
+        expected=bool(working >= 0.5 and abs(line.cpa_range_m) <= expected_cpa_m),
     )
 
 

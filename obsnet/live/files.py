@@ -14,8 +14,15 @@ from obsnet.errors import OutputError
 from obsnet.live.ships import Ships
 from obsnet.live.store import Store
 from obsnet.output import write_text
-from obsnet.run import DETECTION_COLUMNS, DETECTION_DIGITS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
 from obsnet.signals.station import Station
+from obsnet.tables import (
+    DETECTION_COLUMNS,
+    DETECTION_DIGITS,
+    TRACK_COLUMNS,
+    detections_csv,
+    geojson,
+    tracks_csv,
+)
 
 _CHECKED_DAYS = 3
 

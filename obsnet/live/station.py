@@ -30,9 +30,9 @@ from obsnet.live.sources import Source
 from obsnet.live.store import LIVE_COLUMNS, Store, plain_rows
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.pipeline import Minutes, Pipeline
-from obsnet.run import DETECTION_COLUMNS
 from obsnet.signals.spectra import SpectraBuilder
 from obsnet.signals.station import Station
+from obsnet.tables import DETECTION_COLUMNS
 
 _SECOND = 1_000_000_000
 _FOREVER = 1 << 29

@@ -21,7 +21,7 @@ import pandas as pd
 from obsnet.errors import OutputError
 from obsnet.live.packets import Packet
 from obsnet.output import prepare_folder
-from obsnet.run import DETECTION_COLUMNS, TRACK_COLUMNS
+from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 
 LIVE_COLUMNS = [
     "time", "existence", "azimuth_deg", "azimuth_std_deg", "range_m", "range_std_m", "course_deg", "speed_mps",

@@ -1,0 +1,64 @@
+"""Detections and tracks out, as the text of the files that people use: CSV and GeoJSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from obsnet.layout import iso
+from obsnet.signals.station import Station
+from obsnet.trackers.track import Track
+
+DETECTION_COLUMNS = [
+    "time",
+    "coverage",
+    "azimuth_deg",
+    "azimuth_llr",
+    "range_m",
+    "range_rate_mps",
+    "range_llr",
+]
+DETECTION_DIGITS = {
+    "coverage": 3, "azimuth_deg": 2, "azimuth_llr": 3, "range_m": 1, "range_rate_mps": 2, "range_llr": 3,
+}  # fmt: skip
+TRACK_COLUMNS = [
+    "track", "start", "end", "cpa_time", "cpa_distance_m", "cpa_azimuth_deg", "course_deg", "speed_mps", "cpa_time_std_s",
+    "cpa_distance_std_m", "course_std_deg", "speed_std_mps", "log_bayes_factor",
+]  # fmt: skip
+
+
+def detections_csv(detections: pd.DataFrame) -> str:
+    """Text of detections.csv: ISO times, empty cells where there is no estimate."""
+    table = detections.reindex(columns=DETECTION_COLUMNS).copy()
+    stamps = table["time"].to_numpy("datetime64[s]")
+    table["time"] = np.char.add(np.datetime_as_string(stamps), "Z") if len(stamps) else table["time"]
+    return table.round(DETECTION_DIGITS).to_csv(index=False)
+
+
+def tracks_csv(rows: pd.DataFrame) -> str:
+    """Text of tracks.csv."""
+    return rows.to_csv(index=False, float_format="%.6g")
+
+
+def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
+    """Tracks as timed LineStrings in WGS 84 (a FeatureCollection, RFC 7946)."""
+    from pyproj import Proj
+
+    local = Proj(proj="aeqd", lat_0=station.latitude, lon_0=station.longitude, datum="WGS84")
+    features = []
+    for number, found in enumerate(tracks, 1):
+        if not np.isfinite(found.std[2]):
+            continue
+        times, east, north = found.positions(300.0)
+        longitude, latitude = local(east, north, inverse=True)
+        properties = {key: None if value != value else value for key, value in found.row(number).items()}
+        properties["times"] = [iso(t) for t in times]
+        properties["method"] = found.method
+        coordinates = [
+            [round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)
+        ]
+        line = {"type": "LineString", "coordinates": coordinates}
+        features.append({"type": "Feature", "geometry": line, "properties": properties})
+    return {"type": "FeatureCollection", "features": features}
