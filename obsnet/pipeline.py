@@ -99,8 +99,8 @@ class Pipeline:
     ----------
     station : Station; its depth and the ocean's profile make the propagation table.
     config : RunConfig
-    amplitudes : strength of each path pair against range; by default the paper's Table II, carried on
-        and scaled to the depth.
+    amplitudes : strength of each path pair against range; by default weak, broad curves
+        scaled to the depth (`Amplitudes.broad`).
     table : propagation table, if it is not to be made from `config.ocean`.
     """
 
@@ -114,12 +114,12 @@ class Pipeline:
     ) -> None:
         self.station, self.config = station, config
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
-        amplitudes = amplitudes or Amplitudes.default().scaled_to(station.depth_m)
+        expected = amplitudes or Amplitudes.broad().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
         self._learned = (
             _learned_azimuth(config) if config.detector in ("learned", "learned-azimuth") else None
         )
-        self._range = _range_detector(config, self.table, amplitudes, threads)
+        self._range = _range_detector(config, self.table, expected, threads)
         self._clutter = ClutterFilter(config.cepstrogram)
         self._background = BackgroundDirection(
             config.azimuth.background_window_s, config.azimuth.background_step_s
@@ -344,7 +344,7 @@ def _range_detector(
     return AnalyticRangeDetector(table, amplitudes, config.range, threads)
 
 
-def _follower(table: xr.Dataset, amplitudes: Amplitudes) -> StationFocalization:
+def _follower(table: xr.Dataset, amplitudes: Amplitudes | None) -> StationFocalization:
     from obsnet.trackers.station_focalization import StationFocalization
 
     return StationFocalization(table, amplitudes=amplitudes)

@@ -93,6 +93,25 @@ class Amplitudes:
         """The path pairs, as given."""
         return tuple(self.curves)
 
+    @classmethod
+    def broad(cls) -> Amplitudes:
+        """Weak, wide curves for a station and a bottom that nobody has calibrated.
+
+        Where a pair has amplitude a and the detector expects μ, a frame of noise σ is worth (2aμ − μ²)/2σ². Half of the true
+        amplitude still earns three quarters of the most there is (μ = a), while an absent pair costs −μ²/2σ². How far a pair
+        is heard goes with the bottom: a table fitted at one station reads the pair 1-3 of a near ship, which it does not
+        expect inside two depths, as the pair 3-5 of one twice as far and twice as fast. So each curve begins where geometry lets its pair
+        begin, lasts as long as a reflecting bottom may let it last, and expects about half.
+        """
+        curves = {
+            "1-3": SkewNormal(0.90e3, 4.0, 3.5e3, 13.9e3),
+            "3-5": SkewNormal(1.20e3, 4.0, 13.0e3, 26.0e3),
+            "5-7": SkewNormal(0.93e3, 4.0, 23.9e3, 26.0e3),
+            "7-9": SkewNormal(0.75e3, 4.0, 36.9e3, 26.0e3),
+            "9-11": SkewNormal(0.56e3, 4.0, 49.9e3, 26.0e3),
+        }
+        return cls(curves)
+
     def evaluate(self, pair: str, range_m: np.ndarray) -> np.ndarray:
         """Cepstral amplitude of a pair at ranges [m].
 

@@ -193,17 +193,15 @@ class _Finder:
         speed = np.arange(config.min_speed_mps, config.max_speed_mps + 1e-9, 0.5)
         course = np.arange(0.0, 360.0, 10.0) if self.sees_course else np.zeros(1)
         values = self._grid(cpa_time, cpa_range, speed, course, scores)
+        plane = values.max(axis=(0, 3))
         found = []
         for _ in range(config.candidates):
-            t, i, j, q = np.unravel_index(values.argmax(), values.shape)
-            if values[t, i, j, q] <= 0:
+            i, j = np.unravel_index(plane.argmax(), plane.shape)
+            if plane[i, j] <= 0:
                 break
+            t, q = np.unravel_index(values[:, i, j].argmax(), (len(cpa_time), len(course)))
             found.append(np.array([cpa_time[t], cpa_range[i], course[q], speed[j]]))
-            courses = np.arange(q - 2, q + 3) % len(course)
-            around = np.ix_(
-                _near(t, 3, len(cpa_time)), _near(i, 3, len(cpa_range)), _near(j, 2, len(speed)), courses
-            )
-            values[around] = -1.0
+            plane[np.ix_(_near(i, 3, len(cpa_range)), _near(j, 2, len(speed)))] = -1.0
         return found
 
     def _level(self, centre: np.ndarray, level: _Level, scores: ScoreMaps) -> tuple[float, np.ndarray]:
@@ -212,7 +210,7 @@ class _Finder:
             c + np.arange(-h, h + s / 2, s) for c, h, s in zip(centre, level.half, level.step, strict=True)
         ]
         cpa_time, cpa_range, course, speed = axes
-        speed = speed[speed > 0.5]
+        speed = speed[(speed >= self.config.min_speed_mps) & (speed <= self.config.max_speed_mps)]
         course = course if self.sees_course else centre[2:3]
         values = self._grid(cpa_time, cpa_range, speed, course, scores)
         t, i, j, q = np.unravel_index(values.argmax(), values.shape)

@@ -29,6 +29,16 @@ def test_table_ii_peaks_one_pair_after_the_other():
     assert np.all(np.diff([RANGES[peaks[pair].argmax()] for pair in amplitudes.pairs]) > 5e3)
 
 
+def test_broad_curves_expect_less_over_more_ranges():
+    table, broad = Amplitudes.table_ii(), Amplitudes.broad()
+    for pair in table.pairs:
+        fitted, wide = table.evaluate(pair, RANGES), broad.evaluate(pair, RANGES)
+        assert wide.max() < 0.8 * fitted.max()
+        assert np.sum(wide > 0.01) > np.sum(fitted > 0.01)
+    near = broad.evaluate("1-3", np.array([4340.0]))
+    assert near > 0.005 > table.evaluate("1-3", np.array([4340.0]))
+
+
 def test_scaling_keeps_the_amplitude_at_the_same_range_over_depth():
     amplitudes = Amplitudes.table_ii()
     shallow = amplitudes.scaled_to(2170.0)
