@@ -1,0 +1,251 @@
+"""Every detector on every kind of simulated record: who is right how often, at what price.
+
+A row is a choice of azimuth and range maps: of the analytic detectors, of a variant of theirs, of the learned ones, or of one
+sensor each. Rows share the records, the segmentation and the tracker. Thresholds and the recalibration are chosen on
+validation records, which have other seeds than the test records.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy.optimize import minimize
+
+from obsnet.ais import ReferenceTrack, read, reference_tracks
+from obsnet.config import to_dict
+from obsnet.detectors.analytic import AzimuthDetectorConfig
+from obsnet.detectors.maps import detections, presence
+from obsnet.errors import ModelError
+from obsnet.evaluation import evaluate
+from obsnet.experiments.ablation_minutes import CELL_PRIOR, histograms, minute_table
+from obsnet.experiments.ablation_records import KINDS
+from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.output import write_text
+from obsnet.pipeline import RunConfig
+from obsnet.run import Run, find_tracks, track
+from obsnet.signals.cepstrogram import CepstrogramConfig
+from obsnet.signals.station import Station
+
+Maker = Callable[[str, int, float, Path], None]
+"""Writes the record of (kind, seed, hours) into a folder: waveforms.mseed, station.xml, ais.csv, truth.csv."""
+Progress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Where a row's maps come from: names of `BASES`; `recalibrated` by a slope and an offset for each sensor."""
+
+    azimuth: str
+    range: str
+    recalibrated: bool = False
+
+
+BASES: dict[str, RunConfig] = {
+    "analytic": RunConfig(),
+    "mean_cepstrum": RunConfig(cepstrogram=CepstrogramConfig(clutter="mean")),
+    "uniform_null": RunConfig(azimuth=AzimuthDetectorConfig(null="uniform")),
+    "table_ii": RunConfig(),
+    "learned": RunConfig(detector="learned"),
+}
+ROWS: dict[str, Row] = {
+    "analytic": Row("analytic", "analytic"),
+    "analytic recalibrated": Row("analytic", "analytic", recalibrated=True),
+    "mean cepstrum": Row("analytic", "mean_cepstrum"),
+    "paper's null and amplitudes": Row("uniform_null", "table_ii"),
+    "learned azimuth only": Row("learned", "analytic"),
+    "learned range only": Row("analytic", "learned"),
+    "learned both": Row("learned", "learned"),
+}
+VALIDATION_SEED = 1000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run: generators by name, kinds, numbers of test and validation seeds of each, hours of a record, rows."""
+
+    generators: Mapping[str, Maker]
+    kinds: tuple[str, ...] = KINDS
+    seeds: int = 2
+    validation_seeds: int = 1
+    hours: float = 4.0
+    rows: tuple[str, ...] = tuple(ROWS)
+    first_seed: int = 0
+
+    def cases(self, validation: bool) -> list[tuple[str, str, int]]:
+        """Generator, kind and seed of every record."""
+        first, count = (
+            (VALIDATION_SEED, self.validation_seeds) if validation else (self.first_seed, self.seeds)
+        )
+        return [(g, k, first + i) for g in self.generators for i in range(count) for k in self.kinds]
+
+
+def run(plan: Plan, folder: str | Path, progress: Progress | None = None) -> None:
+    """Run what is missing in `folder`; what is there already is kept, so that a study goes on where it stopped.
+
+    Every record leaves ``<generator>/<kind>_<seed>/<row>.csv`` (a row a minute) and ``<row>.json`` (tracks). A row whose model is
+    not there is left out. Delete a record's folder to run it anew.
+    """
+    folder = Path(folder)
+    validation = plan.cases(validation=True)
+    stages: list[tuple[tuple[str, str, int], bool | None]] = [(case, False) for case in validation]
+    if any(ROWS[name].recalibrated for name in plan.rows):
+        stages += [(case, True) for case in validation]
+    stages += [(case, None) for case in plan.cases(validation=False)]
+    for done, (case, recalibrated) in enumerate(stages):
+        wanted = [n for n in plan.rows if recalibrated is None or ROWS[n].recalibrated == recalibrated]
+        _case(plan, folder, case, wanted)
+        if progress is not None:
+            progress(done + 1, len(stages))
+
+
+def _case(plan: Plan, folder: Path, case: tuple[str, str, int], wanted: list[str]) -> None:
+    generator, kind, seed = case
+    place = folder / generator / f"{kind}_{seed}"
+    missing = [name for name in wanted if not (place / f"{_key(name)}.json").exists()]
+    if not missing:
+        return
+    if not (place / "truth.csv").exists():
+        plan.generators[generator](kind, seed, plan.hours, place)
+    runs: dict[str, tuple[Run, float]] = {}
+    for name in missing:
+        try:
+            made, seconds = _compose(ROWS[name], place, runs, folder)
+        except ModelError:
+            continue
+        _keep(place, name, made, seconds)
+    if "analytic" in runs and seed >= VALIDATION_SEED:
+        truth = pd.read_csv(place / "truth.csv")
+        held: dict[str, Any] = {**histograms(runs["analytic"][0].maps, truth)}
+        np.savez_compressed(place / "histograms.npz", **held)
+
+
+def _key(name: str) -> str:
+    digest = hashlib.sha256(
+        json.dumps([to_dict(BASES[b]) for b in (ROWS[name].azimuth, ROWS[name].range)]).encode()
+    )
+    return f"{name.replace(' ', '_').replace(chr(39), '')}-{digest.hexdigest()[:8]}"
+
+
+def _base(name: str, place: Path, runs: dict[str, tuple[Run, float]]) -> tuple[Run, float]:
+    if name not in runs:
+        station = Station.from_stationxml(place / "station.xml")
+        amplitudes = Amplitudes.default().scaled_to(station.depth_m) if name == "table_ii" else None
+        begun = time.process_time()
+        made = track(place / "waveforms.mseed", station, BASES[name], amplitudes=amplitudes, threads=1)
+        runs[name] = made, time.process_time() - begun
+    return runs[name]
+
+
+def _compose(row: Row, place: Path, runs: dict[str, tuple[Run, float]], folder: Path) -> tuple[Run, float]:
+    """The run of a row, and its CPU seconds (NaN where maps of two runs were put together)."""
+    azimuth, seconds = _base(row.azimuth, place, runs)
+    if row.azimuth == row.range and not row.recalibrated:
+        return azimuth, seconds
+    ranged, _ = _base(row.range, place, runs)
+    maps = xr.merge(
+        [
+            azimuth.maps[[n for n in azimuth.maps if str(n).startswith("azimuth")]],
+            ranged.maps[[n for n in ranged.maps if str(n).startswith("range")]],
+        ],
+        combine_attrs="drop_conflicts",
+    )
+    if row.recalibrated:
+        fitted = recalibration(folder)
+        for sensor in ("azimuth", "range"):
+            if f"{sensor}_llr" in maps:
+                slope, offset = fitted[sensor]
+                maps[f"{sensor}_llr"] = maps[f"{sensor}_llr"] * np.float32(slope) + np.float32(offset)
+    ratios = presence(maps)
+    made = replace(
+        azimuth, maps=maps, presence=ratios, detections=detections(maps, ratios), segments=[], tracks=[]
+    )
+    made.segments, made.tracks = find_tracks(made, 1)
+    return made, float("nan")
+
+
+def _keep(place: Path, name: str, made: Run, seconds: float) -> None:
+    truth = pd.read_csv(place / "truth.csv")
+    write_text(
+        place / f"{_key(name)}.csv", minute_table(made.maps, truth).to_csv(index=False, float_format="%.6g")
+    )
+    reference = _reference(place, made, truth)
+    scored = evaluate(made.detections, made.tracks, reference, made.delay)
+    ships = [s.__dict__ for s in scored.ships if s.expected and s.number]
+    summary = {
+        "seconds": seconds,
+        "found": sum(s["track"] is not None for s in ships),
+        "missed": len(scored.missed),
+        "false": len(scored.false_tracks),
+        "coverage": scored.coverage,
+        "ships": [
+            {k: v for k, v in s.items() if k.endswith(("_error_s", "_error_m", "_error_deg"))} for s in ships
+        ],
+    }
+    write_text(place / f"{_key(name)}.json", json.dumps(summary, default=float))
+
+
+def _reference(place: Path, made: Run, truth: pd.DataFrame) -> list[ReferenceTrack]:
+    if not len(truth):
+        return []
+    station = made.station
+    return reference_tracks(
+        read(place / "ais.csv"), (station.latitude, station.longitude), max_range_m=100e3, max_cpa_m=50e3
+    )
+
+
+def recalibration(folder: str | Path) -> dict[str, tuple[float, float]]:
+    """Slope and offset for each sensor, fitted on the validation records' cells by maximum likelihood.
+
+    Returns
+    -------
+    dict of (slope, offset): the recalibrated ratio is slope·llr + offset, a cell's prior `CELL_PRIOR`.
+    """
+    total: dict[str, np.ndarray] = {}
+    for path in sorted(Path(folder).glob("*/*/histograms.npz")):
+        with np.load(path) as held:
+            for key in held.files:
+                total[key] = total.get(key, 0.0) + held[key]
+    fitted = {}
+    for sensor in ("azimuth", "range"):
+        if f"{sensor}_ship" in total:
+            fitted[sensor] = _fit(
+                total["centre"] / total["files"], total[f"{sensor}_ship"], total[f"{sensor}_none"]
+            )
+    return fitted
+
+
+def _fit(centre: np.ndarray, ship: np.ndarray, none: np.ndarray) -> tuple[float, float]:
+    """Slope and offset that minimise the negative log likelihood of cells with and without a ship, at the prior's odds."""
+    weights = (CELL_PRIOR * ship / max(ship.sum(), 1.0), (1.0 - CELL_PRIOR) * none / max(none.sum(), 1.0))
+    odds = np.log(CELL_PRIOR / (1.0 - CELL_PRIOR))
+
+    def loss(parameters: np.ndarray) -> float:
+        logit = np.exp(parameters[0]) * centre + parameters[1] + odds
+        return float(weights[0] @ np.logaddexp(0.0, -logit) + weights[1] @ np.logaddexp(0.0, logit))
+
+    best = minimize(loss, np.array([-1.0, 0.0]), method="Nelder-Mead").x
+    return float(np.exp(best[0])), float(best[1])
+
+
+Outcome = tuple[str, str, pd.DataFrame, dict[str, Any]]
+
+
+def results(plan: Plan, folder: str | Path, validation: bool) -> dict[str, list[Outcome]]:
+    """What is in `folder`: for each row a list of (generator, kind, minutes, summary)."""
+    found: dict[str, list[Outcome]] = {}
+    for name in plan.rows:
+        for generator, kind, seed in plan.cases(validation):
+            path = Path(folder) / generator / f"{kind}_{seed}" / f"{_key(name)}.json"
+            if path.exists():
+                minutes = pd.read_csv(path.with_suffix(".csv"))
+                found.setdefault(name, []).append((generator, kind, minutes, json.loads(path.read_text())))
+    return found
