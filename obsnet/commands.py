@@ -43,7 +43,7 @@ def track(
     import obsnet.run as runs
     from obsnet.output import staged
 
-    settings = run_config(config, overrides, detector, tracker)
+    settings = run_config(config, overrides, detector, tracker, propagation)
     station = read_station(
         station_file, code, start, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
         latitude=latitude, longitude=longitude,
@@ -51,13 +51,12 @@ def track(
     fitted = read_calibration(calibration)
     station = fitted.apply(station) if fitted else station
     reference = read_reference(ais, station) if ais else None
-    table = read_table(propagation)
     with staged(out, leftovers=("live.csv",)) as folder:
         with console.progress("reading and detecting", quiet) as progress:
             task = runs.track if tracking else runs.detect
             run = task(
                 waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-                progress=progress, amplitudes=fitted.amplitudes if fitted else None, table=table,
+                progress=progress, amplitudes=fitted.amplitudes if fitted else None,
             )  # fmt: skip
         runs.write_tables(run, folder)
         run.plot(folder / "report.png", reference=reference)
@@ -92,7 +91,7 @@ def watch(
     from obsnet.live.config import WatchConfig
     from obsnet.live.watch import watch_source
 
-    values = _values(config, overrides, detector=detector)
+    values = _values(config, overrides, propagation, detector=detector)
     if latency is not None:
         section = values.setdefault("live", {})
         if isinstance(section, dict):
@@ -105,7 +104,7 @@ def watch(
     fitted = read_calibration(calibration)
     watch_source(
         source, fitted.apply(station) if fitted else station, settings, out, once=once, check=check,
-        amplitudes=fitted.amplitudes if fitted else None, table=read_table(propagation),
+        amplitudes=fitted.amplitudes if fitted else None,
         say=(lambda line: None) if quiet else console.say,
     )  # fmt: skip
 
@@ -122,19 +121,29 @@ def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False
 
 
 def run_config(
-    path: Path | None, overrides: list[str] | None, detector: str | None, tracker: str | None
+    path: Path | None,
+    overrides: list[str] | None,
+    detector: str | None,
+    tracker: str | None,
+    propagation: Path | None = None,
 ) -> RunConfig:
     """`RunConfig` of a YAML file, overrides of single parameters, and the choices made by options."""
     from obsnet.config import build
     from obsnet.pipeline import RunConfig
 
-    return build(RunConfig, _values(path, overrides, detector=detector, tracker=tracker))
+    return build(RunConfig, _values(path, overrides, propagation, detector=detector, tracker=tracker))
 
 
-def _values(path: Path | None, overrides: list[str] | None, **chosen: str | None) -> dict[str, Any]:
+def _values(
+    path: Path | None, overrides: list[str] | None, propagation: Path | None = None, **chosen: str | None
+) -> dict[str, Any]:
     from obsnet.config import merge_overrides, read_yaml
 
     values = merge_overrides(read_yaml(path) if path else {}, overrides or [])
+    if propagation is not None:
+        ocean = values.setdefault("ocean", {})
+        if isinstance(ocean, dict):
+            ocean["propagation_file"] = str(propagation.resolve())
     return values | {key: value for key, value in chosen.items() if value is not None}
 
 
@@ -154,15 +163,6 @@ def read_calibration(path: Path | None) -> Calibration | None:
     from obsnet.calibration import Calibration
 
     return Calibration.read(path)
-
-
-def read_table(path: Path | None) -> Any:
-    """The propagation table of a file, if one was given."""
-    if path is None:
-        return None
-    from obsnet.ocean.rays import read_propagation
-
-    return read_propagation(path)
 
 
 def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3) -> list:

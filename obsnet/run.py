@@ -7,10 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import resource
-import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,16 +17,17 @@ import pandas as pd
 import xarray as xr
 
 import obsnet
-from obsnet import netcdf
+from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps
 from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import propagation, travel_time
+from obsnet.ocean.rays import propagation_table, travel_time
 from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
+from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
@@ -159,7 +156,7 @@ def _run(
     progress: Progress | None = None,
     threads: int | None = None,
 ) -> Run:
-    clock = _Clock()
+    clock = Clock()
     threads = threads or os.cpu_count() or 1
     source = open_waveforms(
         waveforms, station, starttime=starttime, endtime=endtime, min_rate_hz=config.spectra.analysis_rate_hz
@@ -180,6 +177,8 @@ def _run(
         run.segments, run.tracks = find_tracks(run, threads)
         clock.lap("track")
     run.info = _describe(run, source, clock)
+    if amplitudes is not None:
+        run.info["amplitudes"] = amplitudes.to_dict()
     return run
 
 
@@ -200,7 +199,7 @@ def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: R
 
 
 def _stream(
-    source: Any, config: RunConfig, pipeline: Pipeline, progress: Progress | None, clock: _Clock
+    source: Any, config: RunConfig, pipeline: Pipeline, progress: Progress | None, clock: Clock
 ) -> Iterator[Minutes]:
     for spectra in iter_spectra(source, config.spectra):
         clock.lap("spectra")
@@ -373,25 +372,9 @@ def write_tables(run: Run, folder: Path) -> None:
     write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
 
 
-class _Clock:
-    """Seconds spent per stage."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
-        self._last = now
-
-
-def _describe(run: Run, source: Any, clock: _Clock) -> dict[str, Any]:
-    scale = 1024 if sys.platform != "darwin" else 1024**2
+def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
     return {
-        "obsnet": obsnet.__version__,
-        "versions": {name: _version(name) for name in ("numpy", "scipy", "numba", "xarray", "obspy")},
-        "python": platform.python_version(),
+        **provenance.versions(),
         "station": {
             "code": run.station.code,
             "latitude": run.station.latitude,
@@ -410,7 +393,7 @@ def _describe(run: Run, source: Any, clock: _Clock) -> dict[str, Any]:
         "tracks": len(run.tracks),
         "notes": _notes(run),
         "seconds": {stage: round(value, 3) for stage, value in clock.stages.items()},
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale, 1),
+        "peak_memory_mb": provenance.peak_memory_mb(),
     }
 
 
@@ -421,12 +404,6 @@ def _notes(run: Run) -> list[str]:
     if len(run.presence) and "range" not in run.presence:
         notes.append("no hydrophone: azimuth from polarisation, ambiguous by 180°, no range")
     return notes
-
-
-def _version(package: str) -> str:
-    from importlib.metadata import version
-
-    return version(package)
 
 
 def read_run(folder: str | Path) -> Run:
@@ -466,8 +443,7 @@ def read_run(folder: str | Path) -> Run:
     for name in ("approaching", "leaving"):
         if f"{name}_llr" in features:
             ratios[name] = features[f"{name}_llr"].values
-    ocean = config.ocean
-    table = propagation(ocean.sound_speed(), station.depth_m, ocean.bottom, ocean.ranges())
+    table = propagation_table(config.ocean, station.depth_m)
     return Run(
         station, config, maps, features, found, ratios.dropna(axis=1, how="all"), spans, tracks, table, info
     )

@@ -187,7 +187,7 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
         (["--tracker", "magic"], "tracker must be one of grid, bernoulli, focalization, found 'magic'"),
         (["--jobs", "0"], "--jobs"),
         (["--calibration", "none.yaml"], "cannot read the configuration none.yaml"),
-        (["--propagation", "none.nc"], "cannot read the propagation table none.nc"),
+        (["--propagation", "none.nc"], "none.nc as netCDF 4"),
     ],
 )
 def test_options_that_do_not_serve(refused, options, found):

@@ -163,6 +163,35 @@ def test_any_split_of_the_record_gives_the_same_rows(tracked, finished, stream, 
     assert (out / "tracks.csv").read_bytes() == (finished / "tracks.csv").read_bytes()
 
 
+def test_a_run_read_again_is_the_run(finished):
+    """Segments of the folder's files are those of the run: what tells closing from opening is kept."""
+    from obsnet.run import find_tracks, read_run
+
+    run = read_run(finished)
+    found, tracks = find_tracks(run)
+    assert [(s.start, s.end, s.cpa) for s in found] == [(s.start, s.end, s.cpa) for s in run.segments]
+    assert len(tracks) == len(run.tracks)
+    for again, kept in zip(tracks, run.tracks, strict=True):
+        assert abs(again.motion.cpa_time - kept.motion.cpa_time) < 5.0
+
+
+def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_path):
+    """In slower water a delay is heard from farther off; run.json names the table, and the run reads it back."""
+    from obsnet.ocean.rays import propagation_table, write_propagation
+    from obsnet.ocean.sound_speed import OceanConfig
+    from obsnet.run import read_run
+
+    run = read_run(finished)
+    slower = propagation_table(OceanConfig(profile="constant", sound_speed_mps=1450.0), run.station.depth_m)
+    write_propagation(slower, tmp_path / "own.nc")
+    out = tracked(record / "waveforms.mseed", "--propagation", tmp_path / "own.nc")
+    own = read_run(out)
+    assert own.config.ocean.propagation_file == str((tmp_path / "own.nc").resolve())
+    np.testing.assert_allclose(own.table["delay"].values, slower["delay"].values)
+    near = detections(out)["range_m"] / detections(finished)["range_m"]
+    assert near.median() > 1.01
+
+
 def test_a_gap_costs_its_own_minutes(tracked, finished, stream, tmp_path):
     begin, end = START + 4000, START + 4600
     (stream.slice(START, begin) + stream.slice(end)).write(str(tmp_path / "w.mseed"), "MSEED")

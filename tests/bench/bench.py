@@ -1,6 +1,6 @@
 """Benchmarks as ratios measured in one run: ``make bench``.
 
-    python tests/bench/bench.py [--hours 8] [--repeat 3] [--no-obsea] [--no-day]
+    python tests/bench/bench.py [--hours 8] [--repeat 3] [--no-obsea] [--no-day] [--no-experiments]
 
 Waveforms are simulated. Whole processes are timed from outside; `obsea`'s figure is the sum of its stages (azimuth, clutter,
 range, track) in a process of its own on the same record, run after obsnet's and on an otherwise idle machine.
@@ -71,6 +71,20 @@ def track(folder: Path, repeat: int) -> tuple[float, float]:
     return timed(command, repeat)
 
 
+EXPERIMENTS = {"tkbd": 4, "bearings": 50, "clicks": 4, "focalization": 2}
+"""Runs of each of the other papers' experiments that are timed."""
+
+
+def experiments(folder: Path) -> None:
+    """Seconds per run of each experiment, whole process."""
+    for name, runs in EXPERIMENTS.items():
+        clock = time.perf_counter()
+        command = [sys.executable, "-m", "obsnet", "reproduce", name, "--runs", str(runs), "--json"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder)
+        wall = time.perf_counter() - clock
+        print(f"obsnet reproduce {name}, {runs} runs: {wall:.1f} s, {wall / runs:.2f} s a run", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -79,6 +93,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--no-obsea", action="store_true")
     parser.add_argument("--no-day", action="store_true")
+    parser.add_argument("--no-experiments", action="store_true")
     arguments = parser.parse_args()
     print(
         f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, simulated waveforms, four channels at 50 Hz"
@@ -114,6 +129,8 @@ def main() -> None:
             record(day, 24.0)
             wall, peak = track(day, max(arguments.repeat - 2, 1))
             print(f"obsnet track, a station-day: {wall:.2f} s, {peak:.0f} MB")
+        if not arguments.no_experiments:
+            experiments(Path(temporary))
 
 
 if __name__ == "__main__":
