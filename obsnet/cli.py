@@ -395,6 +395,25 @@ def plot(
         console.say(str(path))
 
 
+models = typer.Typer(help="What a learned detector's file is, and whether it can be trusted.")
+app.add_typer(models, name="model")
+ModelPath = Annotated[Path, typer.Argument(help="ONNX file.")]
+
+
+@models.command("info")
+def model_info(
+    file: ModelPath, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False
+) -> None:
+    """Say what a model's card says: task, representation, calibration, metrics, and where it comes from."""
+    commands.model_info(file, as_json)
+
+
+@models.command("verify")
+def model_verify(file: ModelPath) -> None:
+    """Check a model's size, digest, operators, card and shapes, load it and run it once."""
+    commands.model_verify(file)
+
+
 @app.command()
 def version() -> None:
     """Print the version."""

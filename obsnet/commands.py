@@ -195,3 +195,49 @@ def _summary(run: Run, out: Path) -> None:
     if not run.tracks:
         console.say("no ship found" if "track" in run.info["seconds"] else "detections only")
     console.say(f"written to {out}")
+
+
+def model_info(file: Path, as_json: bool = False) -> None:
+    """Say what a model's card says."""
+    from obsnet.detectors.model_card import ModelFile
+
+    found = ModelFile.read(file)
+    card = vars(found.card) | {"sha256": found.digest, "bytes": len(found.content)}
+    if as_json:
+        console.say(json.dumps(card, default=str))
+        return
+    for name, value in card.items():
+        if not isinstance(value, dict):
+            console.say(f"{name}: {value}")
+            continue
+        console.say(f"{name}:")
+        for key, inner in value.items():
+            console.say(f"  {key}: {f'{inner:.6g}' if isinstance(inner, float) else inner}")
+
+
+def model_verify(file: Path) -> None:
+    """Load a model as the detectors do and run it on noise."""
+    import numpy as np
+
+    from obsnet.detectors.model_card import ModelFile, run
+    from obsnet.errors import ModelError
+
+    found = ModelFile.read(file)
+    if found.card.task == "azimuth":
+        from obsnet.detectors.learned import LearnedAzimuthDetector
+
+        LearnedAzimuthDetector(model=file)
+    session = found.session()
+    noise = np.random.default_rng(0)
+    feeds = {
+        item.name: noise.standard_normal([n if isinstance(n, int) else 2 for n in item.shape]).astype(
+            np.float32
+        )
+        for item in session.get_inputs()
+    }
+    said = run(session, feeds)
+    if not np.isfinite(said).all():
+        raise ModelError(f"{file} gives values that are no numbers; export it again")
+    console.say(
+        f"{file}: {found.card.task} model, {len(found.content)} bytes, SHA-256 {found.digest}, can be used"
+    )
