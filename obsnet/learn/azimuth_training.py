@@ -60,7 +60,7 @@ def train(
     assert isinstance(made, AzimuthNetwork)
     say(f"{len(rows)} rows to train on, {len(check)} to validate, {parameters(made)} parameters")
     fit(AzimuthProblem(made, labels), rows, check, folder, trainer)
-    return _finish(made, prepared, folder, labels, trainer, about, say)
+    return finish(made, prepared, folder, labels, trainer, about, say)
 
 
 def finetune(
@@ -126,15 +126,16 @@ def prior_odds(rows: AzimuthRows) -> float:
     return with_ship / (said - with_ship)
 
 
-def _finish(
+def finish(
     network: AzimuthNetwork,
     prepared: PreparedSet,
     folder: str | Path,
     labels: AzimuthTaskConfig,
     trainer: TrainerConfig,
-    about: dict[str, Any] | None,
-    say: Callable[[str], None],
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
 ) -> dict[str, float]:
+    """Calibrate a trained network on validation, measure it on test, and keep all in ``weights.pt``."""
     said = outputs(network, AzimuthRows(prepared, "validation", labels))
     calibration = calibrate(said, labels)
     found = {f"validation_{k}": v for k, v in metrics(apply(said, calibration), said, labels).items()}

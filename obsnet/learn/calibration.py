@@ -13,13 +13,16 @@ from torch.utils.data import DataLoader
 from obsnet.learn.azimuth import HERE, AzimuthRows, AzimuthTaskConfig, Batch, at_turn, minute_losses
 from obsnet.learn.networks import AzimuthNetwork
 
+ENOUGH = 100
+"""Minutes with ships, and minutes without, that it takes to fit one kind of azimuth; else the other kind's fit serves."""
+
 INDEPENDENT_MIN = 3.0
 """Windows of 180 s are independent every so many minutes, at best."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Of full azimuths and of doubled ones: ratio = clip(slope · output + offset, lowest, highest); `exponent` for sums over
+    """Of full azimuths and of doubled ones: ratio = bounded(slope · output + offset, lowest, highest); `exponent` for sums over
     minutes, `prior_odds` of the training draws (removed already).
     """
 
@@ -64,8 +67,9 @@ def calibrate(said: Outputs, config: AzimuthTaskConfig) -> Calibration:
     offsets: list[float] = []
     for doubled in (0.0, 1.0):
         rows = said.batch["doubled"] == doubled
-        weight = said.batch["weight"][rows]
-        if weight.sum() < 60:
+        here = (said.batch["state"][rows] == HERE).any(2)
+        weight = said.batch["weight"][rows] > 0
+        if min((weight & here).sum(), (weight & ~here).sum()) < ENOUGH:
             slopes.append(slopes[0] if slopes else 1.0)
             offsets.append(offsets[0] if offsets else 0.0)
             continue
@@ -87,7 +91,13 @@ def apply(said: Outputs, calibration: Calibration) -> Tensor:
     doubled = said.batch["doubled"].long()
     slope = torch.tensor(calibration.slope)[doubled][:, None, None]
     offset = torch.tensor(calibration.offset)[doubled][:, None, None]
-    return (slope * said.ratio + offset).clamp(calibration.lowest, calibration.highest)
+    return bounded(slope * said.ratio + offset, calibration.lowest, calibration.highest)
+
+
+def bounded(ratio: Tensor, lowest: float, highest: float) -> Tensor:
+    """Ratios over azimuth (last axis) that say more than `highest` are lowered together, so that they keep their shape."""
+    excess = (ratio.amax(-1, keepdim=True) - highest).clamp(min=0.0)
+    return (ratio - excess).clamp(min=lowest)
 
 
 def _slope_offset(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> tuple[float, float]:

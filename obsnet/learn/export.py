@@ -21,7 +21,7 @@ from obsnet.detectors.model_card import CARD_KEY, MOST_BYTES, ModelCard, ModelFi
 from obsnet.errors import ModelError
 from obsnet.learn.azimuth import ROW_CELLS, ROW_MINUTES, AzimuthRows, AzimuthTaskConfig
 from obsnet.learn.azimuth_training import restored
-from obsnet.learn.calibration import Calibration
+from obsnet.learn.calibration import Calibration, bounded
 from obsnet.learn.dataset import PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, parameters
 from obsnet.signals.spectra import SpectraConfig
@@ -43,7 +43,7 @@ class CalibratedAzimuth(nn.Module):
         which = doubled[:, None, None]
         ratio = self.network(invariants, phasor, doubled)
         ratio = (slope + (slope2 - slope) * which) * ratio + (offset + (offset2 - offset) * which)
-        return ratio.clamp(self.calibration.lowest, self.calibration.highest)
+        return bounded(ratio, self.calibration.lowest, self.calibration.highest)
 
 
 def export(weights: str | Path, out: str | Path) -> Path:
