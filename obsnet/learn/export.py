@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import logging
 import os
 import warnings
@@ -17,13 +18,14 @@ import torch
 from torch import Tensor, nn
 
 from obsnet.detectors.azimuth_features import BIN_S, CHANNELS
-from obsnet.detectors.model_card import CARD_KEY, MOST_BYTES, ModelCard, ModelFile, run
+from obsnet.detectors.model_card import CARD_KEY, MODELS, MOST_BYTES, ModelCard, ModelFile, run
 from obsnet.errors import ModelError
 from obsnet.learn.azimuth import ROW_CELLS, ROW_MINUTES, AzimuthRows, AzimuthTaskConfig
 from obsnet.learn.azimuth_training import restored
 from obsnet.learn.calibration import Calibration, bounded
 from obsnet.learn.dataset import PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, parameters
+from obsnet.output import write_text
 from obsnet.signals.spectra import SpectraConfig
 
 TOLERANCE = 1e-4
@@ -102,7 +104,7 @@ def write_onnx(
 ) -> None:
     """Export a model of float32 tensors whose first axis is free, one file; its card goes into the metadata.
 
-    A ``.sha256`` beside the file says which one it is.
+    Its SHA-256 goes on record, see `record_digest`.
     """
     import onnx
 
@@ -132,9 +134,18 @@ def write_onnx(
         raise ModelError(f"the model has {len(content)} bytes, more than {MOST_BYTES}; make it smaller")
     partial = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     partial.write_bytes(content)
-    digest = hashlib.sha256(content).hexdigest()
-    out.with_name(out.name + ".sha256").write_text(f"{digest}  {out.name}\n")
+    record_digest(out, hashlib.sha256(content).hexdigest())
     os.replace(partial, out)
+
+
+def record_digest(path: Path, digest: str) -> None:
+    """Put a model's SHA-256 on record: in the list of the shipped ones, or beside the file."""
+    if path.resolve().parent != MODELS:
+        write_text(path.with_name(path.name + ".sha256"), f"{digest}  {path.name}\n")
+        return
+    listed = MODELS / "digests.json"
+    known = json.loads(listed.read_text()) if listed.is_file() else {}
+    write_text(listed, json.dumps(known | {path.name: digest}, indent=1, sort_keys=True) + "\n")
 
 
 def parity(weights: str | Path, model: str | Path, prepared: str | Path, rows: int = 24) -> float:
