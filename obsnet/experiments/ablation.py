@@ -21,10 +21,10 @@ import xarray as xr
 from scipy.optimize import minimize
 
 from obsnet.ais import ReferenceTrack, read, reference_tracks
-from obsnet.config import to_dict
+from obsnet.config import build, to_dict
 from obsnet.detectors.analytic import AzimuthDetectorConfig
 from obsnet.detectors.maps import detections, presence
-from obsnet.errors import ModelError
+from obsnet.errors import ConfigError, ModelError
 from obsnet.evaluation import evaluate
 from obsnet.experiments.ablation_minutes import CELL_PRIOR, histograms, minute_table
 from obsnet.experiments.ablation_records import KINDS
@@ -54,6 +54,8 @@ BASES: dict[str, RunConfig] = {
     "mean_cepstrum": RunConfig(cepstrogram=CepstrogramConfig(clutter="mean")),
     "uniform_null": RunConfig(azimuth=AzimuthDetectorConfig(null="uniform")),
     "table_ii": RunConfig(),
+    "learned_azimuth": RunConfig(detector="learned-azimuth"),
+    "learned_range": RunConfig(detector="learned-range"),
     "learned": RunConfig(detector="learned"),
 }
 ROWS: dict[str, Row] = {
@@ -61,11 +63,22 @@ ROWS: dict[str, Row] = {
     "analytic recalibrated": Row("analytic", "analytic", recalibrated=True),
     "mean cepstrum": Row("analytic", "mean_cepstrum"),
     "paper's null and amplitudes": Row("uniform_null", "table_ii"),
-    "learned azimuth only": Row("learned", "analytic"),
-    "learned range only": Row("analytic", "learned"),
+    "learned azimuth only": Row("learned_azimuth", "learned_azimuth"),
+    "learned range only": Row("learned_range", "learned_range"),
     "learned both": Row("learned", "learned"),
 }
 VALIDATION_SEED = 1000
+
+
+def add_variant(name: str, sensor: str, model: str) -> None:
+    """Add a row for a learned detector of `sensor` ('azimuth' or 'range') from a model file, the other sensor analytic."""
+    if name in ROWS or sensor not in ("azimuth", "range"):
+        raise ConfigError(
+            f"a variant needs a new name and the sensor azimuth or range, found {name!r} and {sensor!r}"
+        )
+    detector = "learned-azimuth" if sensor == "azimuth" else "learned-range"
+    BASES[name] = build(RunConfig, {"detector": detector, "models": {sensor: model}})
+    ROWS[name] = Row(name, name)
 
 
 @dataclass(frozen=True)

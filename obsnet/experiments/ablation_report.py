@@ -12,7 +12,7 @@ import pandas as pd
 
 from obsnet.errors import OutputError
 from obsnet.evaluation.detections import smad
-from obsnet.experiments.ablation import ROWS, Maker, Outcome, Plan, results, run
+from obsnet.experiments.ablation import ROWS, Maker, Outcome, Plan, add_variant, results, run
 from obsnet.experiments.ablation_records import KINDS
 from obsnet.output import write_text
 from obsnet.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, figure
@@ -42,9 +42,20 @@ def main(makers: Mapping[str, Maker], description: str | None = None) -> None:
     parser.add_argument("--validation-seeds", type=int, default=1)
     parser.add_argument("--hours", type=float, default=4.0)
     parser.add_argument("--report-only", action="store_true", help="write from what is there")
+    parser.add_argument(
+        "--variant",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("NAME", "SENSOR", "MODEL"),
+        help="another model's row",
+    )
     for name, choices in (("kinds", KINDS), ("rows", ROWS), ("generators", makers)):
         parser.add_argument(f"--{name}", nargs="+", choices=list(choices), default=list(choices))
     given = parser.parse_args()
+    for variant in given.variant:
+        add_variant(*variant)
+        given.rows.append(variant[0])
     chosen = {name: makers[name] for name in given.generators}
     numbers = given.seeds, given.validation_seeds, given.hours
     plan = Plan(chosen, tuple(given.kinds), *numbers, tuple(given.rows))
