@@ -351,6 +351,9 @@ def reproduce(
     seed: Annotated[int, typer.Option("--seed")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the figure.")] = None,
+    detector: Annotated[
+        str | None, typer.Option("--detector", help="Of table1: learned, analytic or all.")
+    ] = None,
     jobs: Jobs = None,
     quiet: Quiet = False,
 ) -> None:
@@ -365,6 +368,10 @@ def reproduce(
     options: dict[str, Any] = {"seed": seed, "jobs": jobs or os.cpu_count() or 1}
     if runs is not None:
         options["runs"] = runs
+    if detector is not None:
+        if name != "table1":
+            raise ConfigError(f"experiment {name} has no detectors to choose from; leave --detector out")
+        options["detector"] = detector
     with ExitStack() as whole:
         folder = whole.enter_context(staged(out)) if out is not None else None
         with console.progress(name, quiet or as_json) as progress:

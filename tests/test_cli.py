@@ -302,6 +302,8 @@ def test_a_place_that_cannot_be_written(said, record, tmp_path):
         (["track", "w.mseed"], "Missing option '--station'"),
         (["track", "w.mseed", "--nonsense"], "No such option: --nonsense"),
         (["reproduce", "magic"], "no experiment 'magic'; choose one of table1"),
+        (["reproduce", "tkbd", "--detector", "all"], "experiment tkbd has no detectors to choose from"),
+        (["reproduce", "table1", "--detector", "odd"], "detector must be one of analytic"),
         (["reproduce", "tkbd", "--runs", "0"], "--runs"),
         (["reproduce", "tkbd", "--seed", "-1"], "seed must be a whole number of at least 0"),
         (["plot", ".", "--figure", "4"], "no figure 4; choose one of 3, 5, 6, 7, 8"),
