@@ -103,7 +103,7 @@ def live(station, small, table, tmp_path):
 
 def rows(folder):
     """Lines of the detections of all days, without the header."""
-    files = sorted(folder.glob("detections-*.csv")) or [folder / "detections.csv"]
+    files = sorted(folder.glob("detections*.csv"))
     return [line for file in files for line in file.read_text().splitlines()[1:]]
 
 

@@ -20,7 +20,7 @@ def arrivals(made, delay, rng, latency=55.0):
     return [[made[i] for i in part] for part in np.split(order, cuts)]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_any_packets_within_the_latency_give_the_batch_rows(live, hour, batch, tmp_path, seed):
     rng = np.random.default_rng(seed)
     made = packets(hour, lambda: rng.uniform(0.3, 25.0))

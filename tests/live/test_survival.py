@@ -3,10 +3,7 @@
 import errno
 import json
 import os
-import random
 import resource
-import signal
-import sqlite3
 import time
 
 import numpy as np
@@ -53,36 +50,6 @@ def in_a_child(task):
         status = 0
     finally:
         os._exit(status)
-
-
-def test_killed_at_fifty_instants(station, small, table, hour, batch, tmp_path):
-    made, out = in_order(hour), tmp_path / "live"
-    rng = random.Random(1)
-
-    def watch(once=False):
-        live = LiveStation(station, small, out, table=table)
-        live.run(Ring(made, live.resume, 0.0 if once else 0.004), once)
-        live.close()
-
-    kills = 0
-    while kills < 50:
-        pid = in_a_child(watch)
-        time.sleep(0.02 + rng.random() * 0.25)
-        os.kill(pid, signal.SIGKILL)
-        _, status = os.waitpid(pid, 0)
-        assert status in (0, signal.SIGKILL)
-        kills += status != 0
-        if status == 0:  # the ring is read to its end: begin again from its middle
-            break
-    assert kills > 20
-    assert os.waitpid(in_a_child(lambda: watch(once=True)), 0)[1] == 0
-    assert differences(rows(out), rows(batch)) == []
-    times = [row[:20] for row in rows(out)]
-    assert len(times) == len(set(times))
-    database = sqlite3.connect(out / "obsnet.sqlite")
-    assert [t for (t,) in database.execute("SELECT time FROM detections ORDER BY time")] == times
-    expected = (batch / "tracks.csv").read_text().splitlines()
-    assert len((out / "tracks.csv").read_text().splitlines()) == len(expected)
 
 
 def test_a_restart_goes_on_as_if_nothing_had_happened(live, hour, batch, tmp_path):
