@@ -45,18 +45,20 @@ def train(
     trainer: TrainerConfig = TrainerConfig(),
     about: dict[str, Any] | None = None,
     say: Callable[[str], None] = print,
+    begin_with: str | Path | None = None,
 ) -> dict[str, float]:
     """Train, calibrate on validation, measure on test; ``weights.pt`` and ``metrics.json``'s content come back.
 
     Parameters
     ----------
     folder : of the run. about : anything to keep with the weights, for instance the composed configuration.
+    begin_with : weights of an earlier run to begin with, whose network is then taken.
     """
     rows = AzimuthRows(prepared, "train", labels)
     check = AzimuthRows(prepared, "validation", labels)
     labels = replace(labels, prior_odds=prior_odds(rows))
     network = replace(network, frequencies=rows[0]["phasor"].shape[-1])
-    made = seeded(trainer.seed, lambda: AzimuthNetwork(network))
+    made = restored(begin_with)[0] if begin_with else seeded(trainer.seed, lambda: AzimuthNetwork(network))
     assert isinstance(made, AzimuthNetwork)
     say(f"{len(rows)} rows to train on, {len(check)} to validate, {parameters(made)} parameters")
     fit(AzimuthProblem(made, labels), rows, check, folder, trainer)

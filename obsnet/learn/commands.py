@@ -70,7 +70,10 @@ def train_detector(config: DictConfig) -> float:
             found = training.finetune(prepared, folder, values["weights"], labels, trainer, about, say)
             return min(found["loss_before"], found["loss_after"])
         network = build(AzimuthNetworkConfig, values["network"], "network")
-        return training.train(prepared, folder, network, labels, trainer, about, say)["validation_nll"]
+        found = training.train(
+            prepared, folder, network, labels, trainer, about, say, values.get("begin_with")
+        )
+        return found["validation_nll"]
     raise ConfigError(f"task must be azimuth, found {values['task']!r}")
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +30,7 @@ class TrainerConfig:
 
     Parameters
     ----------
-    epochs, batch, learning_rate, weight_decay : of AdamW under a one-cycle schedule.
+    epochs, batch, learning_rate, weight_decay : of AdamW, whose rate rises and falls once.
     patience : epochs without a better validation loss after which training stops.
     seed : of weights, order and augmentation. threads : of torch; 1 gives the same numbers anywhere.
     max_minutes : training ends after so long.
@@ -85,15 +87,20 @@ class DetectorTask(lightning.LightningModule):
         self.log("validation_loss", value, prog_bar=True, batch_size=len(next(iter(batch.values()))))
 
     def configure_optimizers(self) -> Any:
-        """AdamW, one cycle."""
+        """AdamW; the rate rises and falls once."""
         config = self.config
         optimiser = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
         )
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, config.learning_rate, total_steps=self._steps, pct_start=0.15
-        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, self._rate)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _rate(self, step: int) -> float:
+        """Share of the learning rate: a rise over a tenth of all steps, then half a cosine down to nothing."""
+        rise = max(self._steps // 10, 1)
+        if step < rise:
+            return (step + 1) / rise
+        return 0.5 + 0.5 * math.cos(math.pi * min((step - rise) / max(self._steps - rise, 1), 1.0))
 
 
 def fit(
@@ -108,7 +115,7 @@ def fit(
 
     Parameters
     ----------
-    folder : of checkpoints and ``metrics.csv``; training goes on from ``last.ckpt`` where there is one.
+    folder : of checkpoints and ``log/version_0/metrics.csv``; training goes on from ``last.ckpt`` where there is one.
 
     Returns
     -------
@@ -126,12 +133,14 @@ def fit(
     trainer = lightning.Trainer(
         accelerator="cpu", devices=1, max_epochs=config.epochs, deterministic=True,
         max_time={"seconds": round(60 * config.max_minutes)}, gradient_clip_val=1.0, log_every_n_steps=10,
-        logger=CSVLogger(folder, name="", version=""), enable_progress_bar=progress, enable_model_summary=False,
+        logger=CSVLogger(folder, name="log"), enable_progress_bar=progress, enable_model_summary=False,
         callbacks=[best, EarlyStopping("validation_loss", patience=config.patience)],
         num_sanity_val_steps=0,
     )  # fmt: skip
     last = folder / "last.ckpt"
-    trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
     if not best.best_model_path:
         raise ConfigError("training ended before the first epoch; give it more minutes")
     state = torch.load(best.best_model_path, map_location="cpu", weights_only=True)["state_dict"]

@@ -1,0 +1,219 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("zarr")
+onnx = pytest.importorskip("onnx")
+
+from obsnet.detectors.learned import LearnedAzimuthDetector  # noqa: E402
+from obsnet.detectors.model_card import ModelFile  # noqa: E402
+from obsnet.errors import ConfigError, ModelError  # noqa: E402
+from obsnet.learn import azimuth_training as training  # noqa: E402
+from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig  # noqa: E402
+from obsnet.learn.calibration import bounded  # noqa: E402
+from obsnet.learn.dataset import PreparedSet, Record  # noqa: E402
+from obsnet.learn.export import export, parity  # noqa: E402
+from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
+from obsnet.learn.task import TrainerConfig, load_weights  # noqa: E402
+from obsnet.signals.spectra import SpectraConfig  # noqa: E402
+
+NETWORK = AzimuthNetworkConfig(hidden=4, gates=2, harmonics=6, azimuths=24, width=4, kernel=3)
+TRAINER = TrainerConfig(epochs=2, batch=4, patience=5)
+
+
+def made_record(name, split, ship, seed):
+    """Half an hour of cells: noise, and with a ship a tenth of the frequencies that point to it."""
+    rng = np.random.default_rng(seed)
+    minute = 1369130400.0 + 60.0 * np.arange(30)
+    count, width = 3 * 34, 266
+    first = int((minute[0] - 100.0 - 10.0) // 20)
+    angle = rng.uniform(-1, 1, (count, width))
+    azimuth = rng.uniform(0, 360)
+    if ship:
+        angle[:, 40:70] = (azimuth / 180 + 0.03 * rng.standard_normal((count, 30)) + 1) % 2 - 1
+    invariants = rng.uniform(0, 0.4, (count, 12, width))
+    invariants[:, 4, 40:70] += 0.5 * ship
+    shape = (30, int(ship))
+    arrays = {
+        "cell_index": first + np.arange(count),
+        "invariants": invariants.astype(np.float16),
+        "phasor": (32767 * angle).astype(np.int16),
+        "minute": minute,
+        "azimuth_deg": np.full(shape, azimuth, np.float32),
+        "range_m": np.full(shape, 2e4, np.float32),
+        "known": np.ones(shape, bool),
+    }
+    attributes = {"id": name, "split": split, "source": "twin", "absence_known": True, "ambiguity_deg": 360}
+    return Record(attributes, arrays)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    made = PreparedSet(tmp_path_factory.mktemp("prepared"))
+    for split, number in (("train", 12), ("validation", 6), ("test", 4)):
+        for i in range(number):
+            made.write(made_record(f"{split}-{i}", split, i % 2 == 0, 100 * number + i))
+    return made
+
+
+@pytest.fixture(scope="module")
+def run(prepared, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    training.train(prepared, folder, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    return folder
+
+
+def test_records_come_back_as_they_were_written(prepared):
+    record, again = made_record("train-0", "train", True, 1200), prepared.read("train-0")
+    for name, values in record.arrays.items():
+        np.testing.assert_array_equal(again.arrays[name], values)
+    assert prepared.names("validation") == [f"validation-{i}" for i in range(6)]
+    assert len(prepared.digest()) == 64 and prepared.digest() == PreparedSet(prepared.folder).digest()
+
+
+def test_an_empty_folder_is_no_set(tmp_path):
+    with pytest.raises(ConfigError, match=r"prepare\.py"):
+        AzimuthRows(PreparedSet(tmp_path), "train")
+
+
+def test_weights_say_where_they_come_from(run, prepared):
+    _, about = load_weights(run / "weights.pt")
+    assert about["data_digest"] == prepared.digest()
+    assert about["trainer"]["seed"] == 0 and about["labels"]["prior_odds"] == pytest.approx(1.0)
+    assert about["metrics"]["test_minutes_with"] == 60
+    assert (run / "log" / "version_0" / "metrics.csv").read_text().count("\n") >= 3
+
+
+def test_the_same_seed_gives_the_same_weights(run, prepared, tmp_path):
+    training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    first, again = (load_weights(folder / "weights.pt")[0] for folder in (run, tmp_path))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+
+
+def test_training_goes_on_where_it_was_interrupted(prepared, tmp_path):
+    short = replace(TRAINER, epochs=1)
+    training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), short, say=lambda text: None)
+    before = torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"]
+    training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2 * before
+
+
+def test_files_that_are_no_weights_are_refused(tmp_path):
+    with pytest.raises(ModelError, match=r"train\.py"):
+        load_weights(tmp_path / "none.pt")
+    (tmp_path / "junk.pt").write_bytes(b"junk")
+    with pytest.raises(ModelError, match="no weights"):
+        load_weights(tmp_path / "junk.pt")
+
+
+def test_bounds_keep_the_shape_of_a_map():
+    ratio = torch.tensor([[1.0, 20.0, 18.0, -9.0]])
+    torch.testing.assert_close(bounded(ratio, -8.0, 12.0), torch.tensor([[-7.0, 12.0, 10.0, -8.0]]))
+
+
+@pytest.fixture(scope="module")
+def model(run, tmp_path_factory):
+    return export(run / "weights.pt", tmp_path_factory.mktemp("model") / "azimuth.onnx")
+
+
+def test_the_file_says_what_pytorch_says(run, prepared, model):
+    assert parity(run / "weights.pt", model, prepared.folder) < 1e-4
+    assert model.stat().st_size < 2_000_000
+
+
+def test_parity_fails_for_other_weights(prepared, model, tmp_path):
+    other = replace(TRAINER, seed=5, epochs=1)
+    training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), other, say=lambda text: None)
+    with pytest.raises(ModelError, match="differs"):
+        parity(tmp_path / "weights.pt", model, prepared.folder)
+
+
+def test_the_card_travels_with_the_file(model, prepared):
+    found = ModelFile.read(model, "azimuth")
+    assert found.card.data_digest == prepared.digest()
+    assert found.card.grids == {"minutes": 10, "frequencies": 266, "azimuths": 24}
+    detector = LearnedAzimuthDetector(model=model)
+    assert detector.card.representation["features"]["fmax_hz"] == 24.0
+
+
+def test_a_model_that_does_not_fit_is_refused(model):
+    with pytest.raises(ModelError, match="hop_s"):
+        LearnedAzimuthDetector(spectra=SpectraConfig(hop_s=5.12), model=model)
+    with pytest.raises(ModelError, match="up to 24 Hz"):
+        LearnedAzimuthDetector(spectra=SpectraConfig(analysis_rate_hz=25.0), model=model)
+    with pytest.raises(ModelError, match="not for range"):
+        ModelFile.read(model, "range")
+
+
+def altered(model, path, change):
+    proto = onnx.load(model)
+    change(proto)
+    path.write_bytes(proto.SerializeToString())
+    return path
+
+
+def test_altered_files_are_refused(model, tmp_path):
+    content = bytearray(model.read_bytes())
+    content[len(content) // 2] ^= 1
+    target = tmp_path / "azimuth.onnx"
+    target.write_bytes(bytes(content))
+    (tmp_path / "azimuth.onnx.sha256").write_text((model.parent / "azimuth.onnx.sha256").read_text())
+    with pytest.raises(ModelError, match="altered"):
+        ModelFile.read(target)
+    (tmp_path / "half.onnx").write_bytes(model.read_bytes()[: len(content) // 2])
+    with pytest.raises(ModelError, match="damaged"):
+        ModelFile.read(tmp_path / "half.onnx")
+    (tmp_path / "large.onnx").write_bytes(bytes(2_000_001))
+    with pytest.raises(ModelError, match="at most 2000000"):
+        ModelFile.read(tmp_path / "large.onnx")
+
+
+def test_models_that_could_do_more_than_compute_are_refused(model, tmp_path):
+    def external(proto):
+        tensor = proto.graph.initializer[0]
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="/etc/passwd")
+
+    with pytest.raises(ModelError, match="other files"):
+        ModelFile.read(altered(model, tmp_path / "external.onnx", external))
+
+    def operator(proto):
+        proto.graph.node[0].op_type = "PyOp"
+        proto.graph.node[0].domain = "ai.onnx.contrib"
+
+    with pytest.raises(ModelError, match=r"ai\.onnx\.contrib\.PyOp"):
+        ModelFile.read(altered(model, tmp_path / "operator.onnx", operator))
+
+    def nested(proto):
+        graph = onnx.helper.make_graph([], "inner", [], [])
+        proto.graph.node[0].attribute.append(onnx.helper.make_attribute("then_branch", graph))
+
+    with pytest.raises(ModelError, match="graphs within"):
+        ModelFile.read(altered(model, tmp_path / "nested.onnx", nested))
+
+    def cardless(proto):
+        del proto.metadata_props[:]
+
+    with pytest.raises(ModelError, match="no card"):
+        ModelFile.read(altered(model, tmp_path / "cardless.onnx", cardless))
+
+
+def test_finetuning_keeps_the_old_weights_unless_held_out_passages_are_better(run, prepared, tmp_path):
+    still = replace(TRAINER, epochs=1, learning_rate=1e-12)
+    said = []
+    found = training.finetune(prepared, tmp_path, run / "weights.pt", trainer=still, say=said.append)
+    old, new = (load_weights(folder / "weights.pt")[0] for folder in (run, tmp_path))
+    if not found["adapted"]:
+        assert all(torch.equal(old[name], new[name]) for name in old)
+        assert "kept the old" in said[-1]
+    assert json.dumps(load_weights(tmp_path / "weights.pt")[1]["finetune"]["data_digest"])
+    spoilt = replace(TRAINER, epochs=1, learning_rate=3.0)
+    found = training.finetune(
+        prepared, tmp_path / "spoilt", run / "weights.pt", trainer=spoilt, say=said.append
+    )
+    assert found["adapted"] == 0.0 and found["loss_after"] > found["loss_before"]
+    spoilt_state = load_weights(tmp_path / "spoilt" / "weights.pt")[0]
+    assert all(torch.equal(old[name], spoilt_state[name]) for name in old)
