@@ -341,6 +341,34 @@ def watch(
     )  # fmt: skip
 
 
+@app.command()
+def archive(
+    waveforms: Annotated[Path, typer.Argument(metavar="SDS", help="SDS archive of waveforms.")],
+    stations: Annotated[
+        list[Path], typer.Option("--stations", help="StationXML file or folder; repeatable.")
+    ],
+    start: Annotated[str, typer.Option("--start", help="First UTC date.")],
+    end: Annotated[str, typer.Option("--end", help="UTC date after the last.")],
+    out: Out,
+    select: Annotated[
+        str | None, typer.Option("--select", help="NET.STA, comma separated, wildcards allowed.")
+    ] = None,
+    detector: DetectorName = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    jobs: Jobs = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, over own processes.")
+    ] = None,
+    quiet: Quiet = False,
+) -> int:
+    """Detect and track many station-days of an SDS archive; resumes where it stopped, status 3 if a day failed."""
+    return commands.archive(
+        waveforms, stations, start, end, out, select=select, detector=detector, config=config, overrides=overrides, jobs=jobs,
+        scheduler=scheduler, quiet=quiet,
+    )  # fmt: skip
+
+
 EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsnet import console
+from obsnet.errors import ConfigError
 
 if TYPE_CHECKING:
     from obsnet.calibration import Calibration
@@ -118,6 +120,46 @@ def evaluate(folder: Path, ais: Path, quiet: bool = False, as_json: bool = False
         console.say(json.dumps(evaluation.to_json()))
     elif not quiet:
         console.say(evaluation.table())
+
+
+def archive(
+    waveforms: Path,
+    stations: list[Path],
+    start: str,
+    end: str,
+    out: Path,
+    *,
+    select: str | None,
+    detector: str | None,
+    config: Path | None,
+    overrides: list[str] | None,
+    jobs: int | None,
+    scheduler: str | None,
+    quiet: bool,
+) -> int:
+    """Work through an archive and say what became of it; 3 if a station-day failed, else 0."""
+    require_extra("archive", "distributed", "pyarrow", "zarr")
+    from obsnet.archive import archive as work_through
+
+    settings = run_config(config, overrides, detector, None)
+    with console.progress("station-days", quiet) as progress:
+        report = work_through(
+            waveforms, list(stations), start, end, out, settings, select=select.split(",") if select else None, jobs=jobs,
+            scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+    if not quiet:
+        for line in report.lines():
+            console.say(line)
+    return 3 if len(report.failed) else 0
+
+
+def require_extra(extra: str, *packages: str) -> None:
+    """`ConfigError` where packages of an optional extra are not installed."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"this needs {', '.join(missing)}; install obsnet with its extra: pip install 'obsnet[{extra}]'"
+        )
 
 
 def run_config(

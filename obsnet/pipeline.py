@@ -21,7 +21,7 @@ from obsnet.detectors.analytic import (
     AzimuthDetectorConfig,
     RangeDetectorConfig,
 )
-from obsnet.detectors.azimuth_features import LOOK_AHEAD_S
+from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
 from obsnet.detectors.background import BackgroundDirection
 from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, presence, window_bounds
 from obsnet.detectors.model_card import shipped
@@ -81,6 +81,18 @@ class RunConfig:
                 choices = ", ".join(get_args(hints[name]))
                 raise ConfigError(f"{name} must be one of {choices}, found {getattr(self, name)!r}")
 
+    @property
+    def memory_s(self) -> float:
+        """How far back a minute's maps depend on the record: what the filters that learn from the past keep, s."""
+        windows = [self.azimuth.window_s]
+        if self.cepstrogram.clutter != "none":
+            windows.append(self.cepstrogram.clutter_window_s + self.cepstrogram.clutter_step_s)
+        if self.azimuth.null == "directional":
+            windows.append(self.azimuth.background_window_s + self.azimuth.background_step_s)
+        if self.detector in ("learned", "learned-azimuth"):
+            windows.append(FeatureConfig.memory_s + FeatureConfig.memory_step_s)
+        return max(windows) + self.azimuth.window_s
+
 
 @dataclass(frozen=True)
 class Minutes:
@@ -102,6 +114,7 @@ class Pipeline:
     amplitudes : strength of each path pair against range; by default weak, broad curves
         scaled to the depth (`Amplitudes.broad`).
     table : propagation table, if it is not to be made from `config.ocean`.
+    begin : s since 1970; earlier frames are heard, so that the filters have learned by then, but have no minutes.
     """
 
     def __init__(
@@ -111,8 +124,9 @@ class Pipeline:
         amplitudes: Amplitudes | None = None,
         table: xr.Dataset | None = None,
         threads: int | None = None,
+        begin: float = -np.inf,
     ) -> None:
-        self.station, self.config = station, config
+        self.station, self.config, self.begin = station, config, begin
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         expected = amplitudes or Amplitudes.broad().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
@@ -145,7 +159,8 @@ class Pipeline:
             if self._learned is not None:
                 self._learned.reset()
         if self._next is None:
-            self._next = float(np.ceil(times[0] / self.config.azimuth.step_s) * self.config.azimuth.step_s)
+            first = max(times[0], self.begin)
+            self._next = float(np.ceil(first / self.config.azimuth.step_s) * self.config.azimuth.step_s)
         self._take(spectra)
         self._last = float(times[-1])
         ready = times[-1] - self.config.azimuth.window_s / 2

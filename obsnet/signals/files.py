@@ -89,6 +89,17 @@ def _day_overlaps(name: str, begin: int | None, end: int | None) -> bool:
     return (begin is None or midnight + 2 * _DAY_NS > begin) and (end is None or midnight - _DAY_NS < end)
 
 
+def archived_days(folder: Path, code: str) -> set[str]:
+    """Dates (ISO text) for which an SDS archive holds a file of a station, from the files' names."""
+    network, _, name = code.partition(".")
+    dates = set()
+    for path in folder.glob(f"[0-9][0-9][0-9][0-9]/{network}/{name}/*.D/*"):
+        match = _SDS_FILE.match(path.name)
+        if match is not None and (match.group(1), match.group(2)) == (network, name):
+            dates.add(str(np.datetime64(match.group(5), "D") + int(match.group(6)) - 1))
+    return dates
+
+
 class FileReader:
     """Reads whole files through obspy, keeping the last few.
 
