@@ -369,6 +369,17 @@ def archive(
     )  # fmt: skip
 
 
+@app.command()
+def serve(
+    folder: Annotated[Path, typer.Argument(help="Folder of `obsnet track` or of `obsnet watch`.")],
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0 for any free one.")] = 8080,
+    ais: AisFile = None,
+) -> None:
+    """Show a folder's tracks and maps as a page in the browser; read-only."""
+    commands.serve(folder, host, port, ais)
+
+
 EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
 
 

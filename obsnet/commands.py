@@ -153,6 +153,27 @@ def archive(
     return 3 if len(report.failed) else 0
 
 
+def serve(folder: Path, host: str, port: int, ais: Path | None) -> None:
+    """Serve a folder's page until it is stopped."""
+    require_extra("serve", "starlette", "uvicorn", "plotly")
+    from obsnet.ais import read, reference_tracks
+    from obsnet.serve.server import is_loopback
+    from obsnet.serve.server import serve as listen
+
+    def ready(address: str) -> None:
+        console.say(f"{folder} at {address} (Ctrl-C ends it)")
+        if not is_loopback(host):
+            console.say("note: other machines can reach this page; it has no password")
+
+    listen(
+        folder,
+        host,
+        port,
+        None if ais is None else (lambda at: reference_tracks(read(ais), at)),
+        ready,
+    )
+
+
 def require_extra(extra: str, *packages: str) -> None:
     """`ConfigError` where packages of an optional extra are not installed."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]

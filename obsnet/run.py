@@ -429,7 +429,7 @@ def read_run(folder: str | Path) -> Run:
             Segment(*(s[key] and _seconds(s[key]) for key in ("start", "end", "cpa")))
             for s in info["segments"]
         ]
-        tracks = [_track_of_row(row) for _, row in rows.iterrows()]
+        tracks = [track_of_row(row) for _, row in rows.iterrows()]
     except FileNotFoundError as error:
         missing = Path(error.filename).name if folder.is_dir() else "the folder"
         raise LayoutError(f"{folder} is not a folder of `obsnet track`: {missing} is missing") from None
@@ -460,7 +460,8 @@ def _minutes(path: Path, count: int) -> xr.Dataset:
     return dataset
 
 
-def _track_of_row(row: pd.Series) -> Track:
+def track_of_row(row: pd.Series) -> Track:
+    """The track of a row of tracks.csv, with variances only: infinite where the row is empty."""
     start, end, cpa = (_seconds(row[key]) for key in ("start", "end", "cpa_time"))
     starboard = wrap180(row["cpa_azimuth_deg"] - row["course_deg"]) < 0
     distance = -row["cpa_distance_m"] if starboard else row["cpa_distance_m"]

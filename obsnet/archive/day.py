@@ -143,8 +143,9 @@ def _table(minutes: Minutes) -> pd.DataFrame:
 
 
 def _nothing(day: Day, source: WaveformSource) -> str:
-    why = [
-        f"{seed_id}: {channel.gap_s:g} s of gaps, {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
+    why = [f"{Path(path).name}: {reason}" for path, reason in list(source.report.ignored.items())[:4]]
+    why += [
+        f"{seed_id}: {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
         for seed_id, channel in source.report.channels.items()
     ]
     return (

@@ -142,7 +142,7 @@ def test_a_bad_day_is_reported_and_the_rest_is_done(command, three_days, tmp_pat
     status, lines, errors = command(three_days, tmp_path / "out", "--jobs", "2", end="2013-05-25")
     assert (status, errors) == (3, [])
     (bad,) = [line for line in lines if line.startswith("failed")]
-    assert "2013-05-22" in bad and "no usable waveforms" in bad
+    assert "2013-05-22" in bad and "142: " in bad
     report = pd.read_csv(tmp_path / "out" / "report.csv")
     assert list(report["status"]) == ["done", "failed", "done", "no data"]
     assert report["error"].notna().sum() == 1
@@ -152,9 +152,9 @@ def test_other_parameters_or_metadata_are_refused_and_nothing_is_lost(command, s
     out = tmp_path / "out"
     assert command(sds, out)[0] == 0
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
-    status, _, errors = command(sds, out, "--set", "azimuth.max_frequency_hz=20")
+    status, _, errors = command(sds, out, "--set", "azimuth.detection_probability=0.5")
     assert status == 2 and len(errors) == 1
-    assert "azimuth." in errors[0] and "was begun with" in errors[0]
+    assert "was begun with azimuth.detection_probability = " in errors[0]
     text = (record / "station.xml").read_text()
     other = tmp_path / "other.xml"
     other.write_text(text.replace("<Elevation>", "<Elevation>-1").replace("--1", "-1"))
