@@ -28,7 +28,7 @@ $(DEMO)/.done: pyproject.toml constraints.txt
 
 $(TEST)/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(TEST)
-	$(TEST)/bin/python $(PIP) -e ".[ais,train,bench,dev]"
+	$(TEST)/bin/python $(PIP) -e ".[ais,archive,serve,train,bench,dev]"
 	touch $@
 
 clean:

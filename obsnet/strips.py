@@ -18,6 +18,8 @@ LLR = (-30.0, 30.0)
 """Log-likelihood ratios shown, nats."""
 LEVEL = (20.0, 150.0)
 """Power spectral densities shown, dB re 1 µPa²/Hz or 1 (nm/s)²/Hz."""
+MOST_CELLS = 180
+"""Cells of a column of a map."""
 DENSITIES = {"Pa²": (120.0, "dB re 1 µPa²/Hz"), "(m/s)²": (180.0, "dB re 1 (nm/s)²/Hz")}
 HANN_NOISE_BINS = 1.5
 """Equivalent noise bandwidth of a Hann window, in bins of 1 / its length."""
@@ -50,11 +52,11 @@ def columns(
     axes: dict[str, Axis] = {}
     if "azimuth_llr" in maps:
         values = maps["azimuth_llr"].transpose("time", "azimuth").values
-        made["azimuth"], axes["azimuth"] = _pooled(values, maps["azimuth"].values, 2, "degrees")
+        made["azimuth"], axes["azimuth"] = _pooled(values, maps["azimuth"].values, "degrees")
     if "range_llr" in maps:
         llr = maps["range_llr"].transpose("time", "range", "range_rate").values
         values = range_rate_marginal(llr.astype(np.float32, copy=False))
-        made["range"], axes["range"] = _pooled(values, maps["range"].values, 5, "m")
+        made["range"], axes["range"] = _pooled(values, maps["range"].values, "m")
     if "power" in features:
         power = features["power"].transpose("time", ...)
         offset, unit = DENSITIES.get(power.attrs.get("units", "Pa²"), (0.0, "dB"))
@@ -77,9 +79,10 @@ def plain(axes: dict[str, Axis]) -> dict[str, Any]:
     return {name: asdict(axis) for name, axis in axes.items()}
 
 
-def _pooled(values: np.ndarray, axis: np.ndarray, size: int, unit: str) -> tuple[np.ndarray, Axis]:
-    """The greatest value of each `size` neighbouring cells."""
-    count = values.shape[1] // size
+def _pooled(values: np.ndarray, axis: np.ndarray, unit: str) -> tuple[np.ndarray, Axis]:
+    """The greatest value of neighbouring cells, so many together that at most `MOST_CELLS` are left."""
+    size = -(-len(axis) // MOST_CELLS)
+    count = len(axis) // size
     kept = values[:, : count * size].reshape(len(values), count, size)
     centres = axis[: count * size].reshape(count, size).mean(axis=1)
     return to_bytes(kept.max(axis=2), *LLR), _axis(centres, unit, LLR, "log-likelihood ratio")

@@ -28,6 +28,7 @@ class LiveConfig:
     poll_s : spacing of the looks into a folder.
     selectors : SeedLink selectors, such as BH? BDH; all channels of the StationXML by default.
     memory_h : longest segment that is searched as a whole; its maps stay on disk until it closes.
+    strips_h : how long columns of the maps are kept for the page of `obsnet serve`; 0 for none.
     threads : of the compiled loops.
     nmea : where NMEA sentences go: udp://HOST:PORT or tcp://HOST:PORT (a server there); nowhere by default.
     talker : two letters before TTM and TLL.
@@ -46,6 +47,7 @@ class LiveConfig:
     poll_s: float = 5.0
     selectors: str = ""
     memory_h: float = 72.0
+    strips_h: float = 168.0
     threads: int = 1
     nmea: str = ""
     talker: str = "RA"
@@ -57,7 +59,7 @@ class LiveConfig:
         ):  # fmt: skip
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
-        for name in ("latency_s", "keepalive_s"):
+        for name in ("latency_s", "keepalive_s", "strips_h"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must not be negative, found {getattr(self, name)}")
         if self.threads < 1:

@@ -18,9 +18,10 @@ import numpy as np
 import pandas as pd
 
 import obsnet
+from obsnet import strips
 from obsnet.config import to_dict
 from obsnet.errors import ObsnetError, OutputError
-from obsnet.layout import iso
+from obsnet.layout import iso, to_posix
 from obsnet.live.buffer import WaveformBuffer
 from obsnet.live.config import WatchConfig
 from obsnet.live.files import Files, rounded
@@ -240,7 +241,17 @@ class LiveStation:
         table = rounded(minutes.detections)
         self.store.put("detections", DETECTION_COLUMNS, plain_rows(table, DETECTION_COLUMNS))
         self.ships.keep(minutes)
+        self._keep_strips(minutes, list(table["time"]))
         self._keep_live(rows)
+
+    def _keep_strips(self, minutes: Minutes, times: list[str]) -> None:
+        hours = self.config.live.strips_h
+        if not hours or not times:
+            return
+        made, axes = strips.columns(minutes.maps, minutes.features, self.config.spectra.window_s)
+        self.store.put_strips(times, made, strips.plain(axes))
+        oldest = iso(float(to_posix(minutes.maps["time"].values[-1])) - 3600.0 * hours)
+        self.store.execute("DELETE FROM strips WHERE time < ?", (oldest,))
 
     def _keep_live(self, rows: list[dict[str, Any]]) -> None:
         self.store.put("live", LIVE_COLUMNS, [tuple(row.get(name) for name in LIVE_COLUMNS) for row in rows])

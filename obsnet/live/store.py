@@ -44,6 +44,7 @@ _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS detections ({_columns(DETECTION_COLUMNS, "time")});
 CREATE TABLE IF NOT EXISTS tracks ({_columns(TRACK_COLUMNS, "track")});
 CREATE TABLE IF NOT EXISTS live ({_columns(LIVE_COLUMNS, "time")});
+CREATE TABLE IF NOT EXISTS strips (time TEXT PRIMARY KEY, azimuth BLOB, range BLOB, spectrum BLOB);
 CREATE TABLE IF NOT EXISTS courses (track INTEGER PRIMARY KEY, said TEXT);
 CREATE TABLE IF NOT EXISTS presence (seconds REAL PRIMARY KEY, azimuth REAL, range REAL, approaching REAL, leaving REAL);
 CREATE TABLE IF NOT EXISTS tiles (seconds REAL PRIMARY KEY, arrays BLOB);
@@ -200,6 +201,15 @@ class Store:
             (float(t), *_plain(values)) for t, values in zip(table.index, table.to_numpy(float), strict=True)
         )
         self.put("presence", ("seconds", *_PRESENCE), rows)
+
+    def put_strips(
+        self, times: list[str], columns: Mapping[str, np.ndarray], axes: Mapping[str, Any]
+    ) -> None:
+        """Keep columns of the maps (`obsnet.strips`) by minute."""
+        names = list(columns)
+        rows = zip(times, *([row.tobytes() for row in columns[name]] for name in names), strict=True)
+        self.put("strips", ("time", *names), rows)
+        self.note("strips", axes)
 
     def presence(self) -> pd.DataFrame:
         """Presence ratios kept, indexed by s since 1970; columns without any value are left out."""

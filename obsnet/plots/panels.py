@@ -12,12 +12,10 @@ from obsnet.ocean.rays import tdoa
 from obsnet.plots import style
 from obsnet.plots.columns import Columns, azimuth_columns, range_columns
 from obsnet.run import Run
+from obsnet.strips import DENSITIES, HANN_NOISE_BINS
 
-HANN_NOISE_BINS = 1.5
-"""Equivalent noise bandwidth of a Hann window, in bins of 1 / its length."""
 NO_AZIMUTH = "no two horizontals: no azimuth"
 NO_RANGE = "no hydrophone: no range"
-DENSITIES = {"Pa²": (120.0, "dB re 1 µPa²/Hz"), "(m/s)²": (180.0, "dB re 1 (nm/s)²/Hz")}
 
 
 def spectrogram(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:

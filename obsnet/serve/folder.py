@@ -22,9 +22,10 @@ import pandas as pd
 from obsnet.ais import ReferenceTrack
 from obsnet.errors import LayoutError
 from obsnet.layout import iso, parse_utc, to_posix
-from obsnet.run import DETECTION_COLUMNS, TRACK_COLUMNS, Run, read_run, track_of_row
+from obsnet.run import Run, read_run, track_of_row
 from obsnet.serve.geometry import circle, ship_shape, track_shape
 from obsnet.strips import Axis, columns, plain
+from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from obsnet.trackers.track import Track
 
 DATABASE = "obsnet.sqlite"
