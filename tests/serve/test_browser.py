@@ -82,9 +82,10 @@ def test_a_click_on_the_map_chooses_a_ship(page, opened):
     centre = shown.evaluate(
         """() => { const plan = document.getElementById('plan'), area = plan._fullLayout, box = plan.getBoundingClientRect();
         const trace = plan.data.findLast((t) => t.mode === 'lines' && t.customdata && t.hoverinfo === 'text'), i = Math.floor(trace.x.length / 2);
-        return [box.left + area._size.l + area.xaxis.d2p(trace.x[i]), box.top + area._size.t + area.yaxis.d2p(trace.y[i])]; }"""
+        return [box.left + area.xaxis._offset + area.xaxis.d2p(trace.x[i]), box.top + area.yaxis._offset + area.yaxis.d2p(trace.y[i])]; }"""
     )
-    shown.mouse.move(*centre)
+    shown.mouse.move(*centre, steps=4)
+    shown.wait_for_timeout(300)
     shown.mouse.click(*centre)
     shown.wait_for_selector("#tracks [aria-selected=true]")
     assert "Ship 1" in shown.inner_text("#details")
@@ -116,6 +117,7 @@ def test_the_keyboard_reaches_and_chooses_everything(station_folder, listening, 
         assert "Ship 3" in shown.inner_text("#details")
         shown.keyboard.press("Escape")
         assert shown.locator("#tracks [aria-selected=true]").count() == 0
+        shown.context.close()
 
 
 def test_what_a_station_writes_appears_by_itself(station_folder, listening, opened):
@@ -132,6 +134,7 @@ def test_what_a_station_writes_appears_by_itself(station_folder, listening, open
         write.status(trouble="no packet for 400 s")
         shown.wait_for_selector("#state[data-state=bad]", timeout=15_000)
         assert "no packet for 400 s" in shown.inner_text("#state")
+        shown.context.close()
 
 
 def test_a_time_range_leaves_out_what_is_outside(station_folder, listening, opened):
@@ -144,6 +147,7 @@ def test_a_time_range_leaves_out_what_is_outside(station_folder, listening, open
         shown.check("input[value='6']", force=True)
         shown.wait_for_selector("#track-1", state="detached", timeout=15_000)
         assert shown.locator("#tracks [role=option]").count() == 1
+        shown.context.close()
 
 
 @pytest.mark.parametrize("width", [390, 320])
@@ -164,3 +168,4 @@ def test_a_name_that_is_markup_is_text(station_folder, listening, opened):
         assert "<img" in shown.inner_text("#state")
         assert shown.locator("#state img").count() == 0
         assert np.array_equal(shown.locator("#station b").count(), 0)
+        shown.context.close()

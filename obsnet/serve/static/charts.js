@@ -109,17 +109,27 @@ export function plan(element, state, select) {
     paper_bgcolor: "#fff", plot_bgcolor: "#fff", uirevision: state.view,
   };
   Plotly.react(element, traces, layout, { ...CONFIG, scrollZoom: !narrow() });
-  listen(element, select);
+  listen(element, (point) => trackAt(point, tracks, limit), select);
   const said = tracks.map((t) => `ship ${t.track} nearest at ${(t.cpa_distance_m / 1000).toFixed(1)} km`).join(", ");
   element.setAttribute("aria-label", `Plan view around the station: ${tracks.length ? said : "no track"}${live ? "; a ship is heard now" : ""}`);
 }
 
-function listen(element, select) {
-  if (element.dataset.listens) return;
-  element.dataset.listens = "yes";
+// The track of a point that was clicked: its own, or the nearest where the point is of an AIS ship over it.
+function trackAt(point, tracks, limit) {
+  if (typeof point.customdata === "number") return point.customdata;
+  let best = [0.04 * limit, null];
+  tracks.forEach(({ track, shape }) => (shape.east_km || []).forEach((east, i) => {
+    const away = Math.hypot(east - point.x, shape.north_km[i] - point.y);
+    if (away < best[0]) best = [away, track];
+  }));
+  return best[1];
+}
+
+function listen(element, find, select) {
+  element.removeAllListeners("plotly_click");
   element.on("plotly_click", (event) => {
-    const point = event.points.find((p) => typeof p.customdata === "number");
-    if (point) select(point.customdata);
+    const number = event.points.map(find).find((found) => found !== null && found !== undefined);
+    if (number !== undefined) select(number);
   });
 }
 
@@ -204,7 +214,7 @@ export function strips(element, state, select) {
     paper_bgcolor: "#fff", plot_bgcolor: "#f6f8f9", uirevision: state.view,
   };
   Plotly.react(element, traces, layout, CONFIG);
-  listen(element, select);
+  listen(element, (point) => (typeof point.customdata === "number" ? point.customdata : null), select);
 }
 
 const top = (strip) => ((strip.first + strip.step * strip.count) / 1000);
