@@ -85,6 +85,7 @@ class LiveStation:
         self._rested = self._fresh_at = time.monotonic()
         self._told = -np.inf
         self._restore()
+        self._look()
 
     def run(self, source: Source, once: bool = False) -> None:
         """Take packets until the source ends or `stopping` is set; at the end of a record close it, if `once`."""
@@ -231,6 +232,7 @@ class LiveStation:
         if finished:
             said = pd.concat([rounded(minutes.detections) for minutes in finished])
             self.health.minute(said)
+            self._look()
             self.files.append([str(t) for t in said["time"]])
             if self.stopping.is_set():
                 return
@@ -315,6 +317,7 @@ class LiveStation:
                 self._say(f"the segment from {iso(segment.start)} to {iso(segment.end)} is left: {error}")
                 tracks = []
             self._lasting(lambda s=segment, t=tracks: self.ships.say(s, t), patient)  # type: ignore[misc]
+            self._look()
             if tracks:
                 self._say(f"{len(tracks)} track(s) from {iso(segment.start)} to {iso(segment.end)}")
             try:
@@ -375,6 +378,13 @@ class LiveStation:
 
     # --- what it says of itself ---
 
+    def _look(self) -> None:
+        """Read from the store what `status` tells of it."""
+        ((tracks,),) = self.store.rows("SELECT count(*) FROM tracks")
+        live = self.store.rows(f"SELECT {', '.join(LIVE_COLUMNS)} FROM live ORDER BY time DESC LIMIT 1")
+        row = dict(zip(LIVE_COLUMNS, live[0], strict=True)) if live else None
+        self._known: dict[str, Any] = {"live": row, "tracks": tracks}
+
     def tell(self) -> None:
         """Rewrite status.json."""
         self._told = time.monotonic()
@@ -384,11 +394,9 @@ class LiveStation:
             self.health.trouble = self.health.trouble or str(error)
 
     def status(self) -> dict[str, Any]:
-        """What the station does and how it is, as plain values."""
+        """What the station does and how it is, as plain values; any thread may ask."""
         head = self.buffer.head_ns
         source = self.source
-        ((tracks,),) = self.store.rows("SELECT count(*) FROM tracks")
-        live = self.store.rows(f"SELECT {', '.join(LIVE_COLUMNS)} FROM live ORDER BY time DESC LIMIT 1")
         scale = 1024 if sys.platform != "darwin" else 1024**2
         return {
             "obsnet": obsnet.__version__,
@@ -404,13 +412,14 @@ class LiveStation:
             "models": getattr(self.pipeline, "models", {}),
             **self.health.said(head, "" if source is None else source.trouble),
             "last_sample": None if head is None else iso(head / 1e9),
-            "channels": {seed_id: iso(end / 1e9) for seed_id, end in sorted(self.buffer.newest.items())},
+            "channels": {
+                seed_id: iso(end / 1e9) for seed_id, end in sorted(dict(self.buffer.newest).items())
+            },
             "packets": dict(self.buffer.counts),
             "source_counts": {} if source is None else dict(source.counts),
             "notes": self.buffer.report.notes[-20:],
-            "left_aside": dict(list(self.buffer.report.left_aside.items())[:20]),
-            "live": dict(zip(LIVE_COLUMNS, live[0], strict=True)) if live else None,
-            "tracks": tracks,
+            "left_aside": dict(list(dict(self.buffer.report.left_aside).items())[:20]),
+            **self._known,
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale, 1),
         }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from obsnet.live.config import WatchConfig
+from obsnet.live.outputs import HealthServer, NmeaOutput
 from obsnet.live.sources import open_source
 from obsnet.live.station import LiveStation
 from obsnet.ocean.amplitudes import Amplitudes
@@ -54,11 +55,20 @@ def watch_source(
         say(f"{station.code}: configuration, station, detector, source and output folder are in order")
         return
     live = LiveStation(station, config, out, amplitudes, table, say)
+    opened: list[NmeaOutput | HealthServer] = []
     try:
+        if config.live.nmea:
+            nmea = NmeaOutput(config.live.nmea, config.live.talker)
+            opened.append(nmea)
+            live.listeners.append(nmea)
+        if config.live.http:
+            opened.append(HealthServer(config.live.http, live.status))
         with stopping(live.stopping):
             found = open_source(source, station, config.live, live.resume, live.buffer.floor_ns, once)
             live.run(found, once)
     finally:
+        for output in opened:
+            output.close()
         live.close()
 
 

@@ -122,8 +122,9 @@ def test_bytes_of_nonsense_between_records(record):
     assert len(RecordStream().push(rng.bytes(3_000_000))) == 0
 
 
-def test_nothing_grows(live, hour, tmp_path):
+def test_nothing_grows(live, hour, tmp_path, monkeypatch):
     """Half a day of an hour again and again: what is held in memory and in the store stays what it was after one."""
+    monkeypatch.setattr("obsnet.live.station._REST_S", 0.0)  # a snapshot every ten minutes of data
     one_hour = in_order(hour, 30.0)
     station = live()
 
