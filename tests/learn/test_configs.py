@@ -1,0 +1,58 @@
+from pathlib import Path
+
+import pytest
+
+hydra = pytest.importorskip("hydra")
+pytest.importorskip("torch")
+
+from obsnet.config import build  # noqa: E402
+from obsnet.errors import ConfigError  # noqa: E402
+from obsnet.learn.azimuth import AzimuthTaskConfig  # noqa: E402
+from obsnet.learn.commands import plain, prepare_records  # noqa: E402
+from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
+from obsnet.learn.prepare import ArchiveData, TwinData  # noqa: E402
+from obsnet.learn.task import TrainerConfig  # noqa: E402
+
+CONFIGS = str(Path(__file__).resolve().parents[2] / "configs")
+
+
+def composed(name, *overrides):
+    with hydra.initialize_config_dir(CONFIGS, version_base=None):
+        return hydra.compose(name, list(overrides))
+
+
+@pytest.mark.parametrize("experiment", ["azimuth", "finetune"])
+def test_experiments_compose_and_build(experiment):
+    values = plain(composed("train", f"experiment={experiment}", "out=x"))
+    assert build(TrainerConfig, values["trainer"]).epochs > 0
+    assert build(AzimuthNetworkConfig, values["network"]).gates == 6
+    assert build(AzimuthTaskConfig, values["labels"]).reach_m == 60e3
+    assert values["task"] == "azimuth" and (values["weights"] is None) == (experiment == "azimuth")
+
+
+def test_records_compose_and_build():
+    twin = plain(composed("prepare"))["data"]
+    assert twin.pop("kind") == "twin" and build(TwinData, twin).courses == "obsea"
+    archive = plain(composed("prepare", "data=archive", "station=example"))["data"]
+    assert archive.pop("kind") == "archive" and build(ArchiveData, archive).absence_known is False
+
+
+def test_a_misspelt_key_is_named(tmp_path):
+    config = composed("prepare", "+data.trian=3", f"out={tmp_path}")
+    with pytest.raises(ConfigError, match=r"data\.trian.*'train'"):
+        prepare_records(config)
+
+
+def test_an_archive_needs_its_parts(tmp_path):
+    config = composed("prepare", "data=archive", "station=example", "station.waveforms=''", f"out={tmp_path}")
+    with pytest.raises(ConfigError, match="waveforms, stationxml"):
+        prepare_records(config)
+
+
+def test_a_set_is_not_mixed_with_another(tmp_path):
+    from obsnet.learn.prepare import prepare
+
+    with pytest.raises(ConfigError, match="no prepared record"):
+        prepare(tmp_path, TwinData(train=0, validation=0, test=0))
+    with pytest.raises(ConfigError, match="another first_seed"):
+        prepare(tmp_path, TwinData(train=0, validation=0, test=0, first_seed=5))
