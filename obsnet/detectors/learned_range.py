@@ -16,10 +16,14 @@ import xarray as xr
 
 from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import RangeDetectorConfig, range_maps
-from obsnet.detectors.maps import coverage
-from obsnet.detectors.range_features import Look, RangeFeatures, RangeFeaturesConfig
+from obsnet.detectors.maps import coverage, window_bounds
+from obsnet.detectors.range_features import RangeFeatures, RangeFeaturesConfig
 from obsnet.errors import ConfigError
+from obsnet.layout import to_posix
 
+BATCH = 8192
+CARRIED_SLOPE = 0.3
+"""Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 Scorer = Callable[[np.ndarray], np.ndarray]
 """Feature vectors (n, size) float32 in, log likelihood ratios (n) float32 out."""
 
@@ -31,30 +35,29 @@ class RangeCalibration:
     Parameters
     ----------
     peaks : highest peaks of the cheap score, of each minute, at which the network looks.
-    spread : ranges to either side of a peak at which it looks too.
+    spread : ranges to either side of a peak at which it looks too. rates : range rates about the best one, at each range.
     slope, offset : of the network's score. cheap_slope, cheap_offset, cheap_bound : of the cheap one, and its largest value.
-    bound : of either sign, what validation supports.
+    lowest, highest : of the ratio, what validation supports.
     exponent : of the ratio, because windows overlap.
     """
 
-    peaks: int = 10
+    peaks: int = 6
     spread: int = 2
+    rates: int = 7
     slope: float = 1.0
     offset: float = 0.0
     cheap_slope: float = 0.1
     cheap_offset: float = -2.0
     cheap_bound: float = 0.0
-    bound: float = 12.0
+    lowest: float = -8.0
+    highest: float = 12.0
     exponent: float = 1.0
 
     def __post_init__(self) -> None:
-        if (
-            self.peaks < 1
-            or self.spread < 0
-            or not (self.slope > 0 and self.bound > 0 and 0 < self.exponent <= 1)
-        ):
+        counts, signs = min(self.peaks, self.rates, self.spread + 1) >= 1, self.lowest < 0 < self.highest
+        if not (counts and signs and self.slope > 0 and 0 < self.exponent <= 1):
             raise ConfigError(
-                f"a calibration needs peaks, slope, bound > 0 and an exponent up to 1, found {self}"
+                f"a calibration needs peaks, rates and slope > 0, bounds about 0, exponent up to 1; found {self}"
             )
 
 
@@ -101,8 +104,7 @@ class LearnedRangeDetector:
         Dataset of range_llr (time, range, range_rate) float32, range_coverage (time) float32.
         """
         config, grid = self.config, self._front.config
-        look = self._front.look(cepstrogram, minutes)
-        coarse = self._coarse(look)
+        coarse = self.ratios(cepstrogram, minutes)
         llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
         kernels.resample(
             coarse,
@@ -110,28 +112,38 @@ class LearnedRangeDetector:
             *_weights(config.range_rate, grid.range_rate),
             llr,
         )
-        hop = float(np.median(np.diff(look.frame_time))) if look.frame_time.size > 1 else 1.0
-        covered = coverage(look.valid, look.start, look.stop, minutes, config.window_s, hop)
+        times = to_posix(cepstrogram["time"].values)
+        hop = float(np.median(np.diff(times))) if times.size > 1 else 1.0
+        start, stop = window_bounds(times, minutes, config.window_s)
+        covered = coverage(~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop)
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 
-    def _coarse(self, look: Look) -> np.ndarray:
-        """Calibrated ratio on the features' own grid, (window, rate, range) float32."""
-        cal, front = self.calibration, self._front
-        columns = kernels.peak_columns(look.score, cal.peaks, cal.spread)
-        ratio = np.minimum(cal.cheap_slope * look.score + cal.cheap_offset, cal.cheap_bound)
-        place, column = np.nonzero(columns)
-        rates = front.config.range_rate
-        block = max(8192 // len(rates), 1)
-        for at in range(0, len(place), block):
-            rows, cells = place[at : at + block], column[at : at + block]
+    def ratios(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> np.ndarray:
+        """Calibrated log-likelihood ratios on the features' own grid, (minute, rate, range) float32."""
+        cal = self.calibration
+        said, cheap = self.scores(cepstrogram, minutes)
+        ratio = np.minimum(cal.cheap_slope * cheap + cal.cheap_offset, cal.cheap_bound)
+        looked = np.isfinite(said)
+        ratio[looked] = cal.slope * said[looked] + cal.offset
+        return cal.exponent * np.clip(ratio, cal.lowest, cal.highest)
+
+    def scores(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the network said, NaN where it did not look, and the cheap score: (minute, rate, range) float32 both."""
+        front, cal = self._front, self.calibration
+        look = front.look(cepstrogram, minutes)
+        chosen = kernels.choose(look.score, cal.peaks, cal.spread, cal.rates)
+        place, rate, column = np.nonzero(chosen)
+        said = np.full(look.score.shape, np.nan, np.float32)
+        for at in range(0, len(place), BATCH):
+            part = slice(at, at + BATCH)
+            cells = place[part], rate[part], column[part]
             found = front.features(
-                look, np.repeat(rows, len(rates)),
-                np.repeat(front.config.range_m[cells], len(rates)), np.tile(rates, len(rows)),
-            )  # fmt: skip
-            said = cal.slope * self._scorer(found) + cal.offset
-            ratio[rows, :, cells] = said.reshape(len(rows), len(rates))
-        return cal.exponent * np.clip(ratio, -cal.bound, cal.bound)
+                look, cells[0], front.config.range_m[cells[2]], front.config.range_rate[cells[1]]
+            )
+            said[cells] = self._scorer(found)
+        kernels.carry_on(said, look.score, CARRIED_SLOPE)
+        return said, look.score
 
 
 def _weights(wanted: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

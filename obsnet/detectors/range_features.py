@@ -21,9 +21,11 @@ from obsnet.ocean.rays import interpolate, parse_pair
 from obsnet.signals.cepstrogram import noise_std
 
 FINE_M = 10.0
+FAINTEST = -7.0
+"""Natural log of the least strength of a pair that is told apart from none."""
 OVERSAMPLING = 4
-CONTEXT = ("exists", "energy", "ghost", "slope", "delay", "spread")
-"""What is said of each pair besides its patch."""
+CONTEXT = ("exists", "energy", "ghost", "slope", "delay", "drift", "strength")
+"""What is said of each pair besides its patch; its strength is what the believed table expects of its interference."""
 GLOBALS = ("range_over_depth", "before", "centre", "after", "level", "clutter")
 """What is said once: range over depth, coverage of the sub-windows, and how loud the window's cepstrum is."""
 
@@ -104,12 +106,19 @@ class DelayTable:
         table = interpolate(propagation, np.abs(fine))
         numbers = table["path"].values.tolist()
         shape = (len(config.pairs), fine.size)
-        seconds, phase = np.full(shape, np.nan), np.ones(shape, np.complex64)
+        seconds, phase, self.strength = (
+            np.full(shape, np.nan),
+            np.ones(shape, np.complex64),
+            np.full(shape, FAINTEST),
+        )
+        loudness = _loudness(table)
         for p, pair in enumerate(config.pairs):
             first, second = parse_pair(pair)
             if first in numbers and second in numbers:
                 one, two = table.sel(path=first), table.sel(path=second)
                 seconds[p] = two["delay"].values - one["delay"].values
+                both = loudness[numbers.index(first)] * loudness[numbers.index(second)]
+                self.strength[p] = np.log(np.maximum(2.0 * both, np.exp(FAINTEST)))
                 phase[p] = np.exp(1j * np.angle(one["pressure"].values * two["pressure"].values.conj()))
         reach = config.lag_step_s * (config.lags // 2)
         longest = (n_quefrency - 1) * quefrency_step_s - reach
@@ -223,7 +232,7 @@ class RangeFeatures:
         kernels.describe(
             look.analytic, look.valid, look.frame_time, look.start, look.stop, look.minutes, look.energy, look.score,
             look.once, np.ascontiguousarray(index, np.int64), np.ascontiguousarray(range_m, float),
-            np.ascontiguousarray(rate, float), table.index, table.seconds, table.slope, table.phase, table.inverse,
+            np.ascontiguousarray(rate, float), table.index, table.seconds, table.strength, table.slope, table.phase, table.inverse,
             table.pad, FINE_M, config.range_step_m, config.range_rate, self._lag_step,
             config.window_s / config.sub_windows, config.sub_windows, config.lags, table.depth_m, found,
         )  # fmt: skip
@@ -283,6 +292,14 @@ def analytic_cepstrum(
     out = np.zeros((len(frames), OVERSAMPLING * (n - 1) + 2), np.complex64)
     out[:, :-1] = values[:, : out.shape[1] - 1]
     return out
+
+
+def _loudness(table: xr.Dataset) -> np.ndarray:
+    """Amplitude of each path, of a source just below the surface, over that of all together: (path, range)."""
+    slowest = 1.0 / float(table.attrs.get("surface_speed_mps", 1500.0)) ** 2
+    steepness = np.sqrt(np.maximum(slowest - table["slowness"].values ** 2, 1e-3 * slowest))
+    amplitude = np.nan_to_num(np.abs(table["pressure"].values) * steepness)
+    return amplitude / np.maximum(np.sqrt((amplitude**2).sum(axis=0)), 1e-30)
 
 
 def _inverse(

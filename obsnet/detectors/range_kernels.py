@@ -62,7 +62,7 @@ def hinge(energy):
 
 @njit(cache=True, nogil=True)
 def describe(
-    analytic, valid, frame_time, start, stop, minutes, energy, score, once, window, range_m, rate, index, seconds,
+    analytic, valid, frame_time, start, stop, minutes, energy, score, once, window, range_m, rate, index, seconds, strength,
     slope, phase, inverse, pad, fine_m, coarse_m, rates, lag_step, sub_s, n_sub, n_lags, depth_m, out,
 ):  # fmt: skip
     """Feature vectors of hypotheses: patches stacked along their drift in sub-windows, each pair's context, globals.
@@ -71,7 +71,7 @@ def describe(
     ----------
     analytic … minutes, energy : as of `pair_energy`. score : of `cheap_score`. once : (n_windows, n) said once a minute.
     window : (n) index into `minutes` of each hypothesis. range_m, rate : (n) m and m/s.
-    index, seconds, slope, phase, inverse, pad, fine_m, coarse_m : of `DelayTable`.
+    index, seconds, strength, slope, phase, inverse, pad, fine_m, coarse_m : of `DelayTable`.
     lag_step : quefrency samples from one lag to the next. sub_s : length of a sub-window, s.
     out : (n, size) float32, overwritten.
     """
@@ -85,7 +85,7 @@ def describe(
         centre = pad + int(np.rint(range_m[h] / fine_m))
         for p in range(n_pairs):
             patch = row[p * size : (p + 1) * size]
-            context = row[n_pairs * size + 6 * p : n_pairs * size + 6 * p + 6]
+            context = row[n_pairs * size + 7 * p : n_pairs * size + 7 * p + 7]
             if index[p, centre] == last:
                 patch[:] = 0.0
                 context[:] = 0.0
@@ -120,8 +120,9 @@ def describe(
             context[3] = 1e4 * slope[p, centre]
             context[4] = np.log(seconds[p, centre])
             context[5] = np.abs(1e3 * slope[p, centre] * rate[h])
-        row[n_pairs * (size + 6)] = range_m[h] / depth_m
-        row[n_pairs * (size + 6) + 1 :] = once[w]
+            context[6] = strength[p, centre]
+        row[n_pairs * (size + 7)] = range_m[h] / depth_m
+        row[n_pairs * (size + 7) + 1 :] = once[w]
 
 
 @njit(cache=True, nogil=True)
@@ -151,34 +152,62 @@ def ghost(energy, score, w, p, centre, rate, index, slope, inverse, pad, fine_m,
 
 
 @njit(cache=True, nogil=True)
-def peak_columns(score, peaks, spread):
-    """Ranges at and around the highest peaks, over range rate, of each window's score.
+def choose(score, peaks, spread, rates):
+    """Hypotheses at and around the highest peaks, over range rate, of each window's score.
 
     Parameters
     ----------
     score : (n_windows, n_rates, n_range) float32.
-    peaks : how many, kept `spread` + 1 ranges apart at least. spread : ranges to either side that belong to a peak.
+    peaks : how many, each with `spread` ranges to either side. rates : range rates about the best of each such range.
 
     Returns
     -------
-    bool array (n_windows, n_range).
+    bool array like `score`.
     """
     n_windows, n_rates, n_range = score.shape
-    chosen = np.zeros((n_windows, n_range), np.bool_)
+    chosen = np.zeros(score.shape, np.bool_)
     best = np.empty(n_range, np.float32)
+    rate = np.empty(n_range, np.int64)
     for w in range(n_windows):
         best[:] = score[w, 0]
+        rate[:] = 0
         for k in range(1, n_rates):
             for i in range(n_range):
-                best[i] = max(best[i], score[w, k, i])
+                if score[w, k, i] > best[i]:
+                    best[i] = score[w, k, i]
+                    rate[i] = k
         for _ in range(peaks):
             top = np.argmax(best)
             if best[top] <= 0.0:
                 break
             for i in range(max(top - spread, 0), min(top + spread + 1, n_range)):
-                chosen[w, i] = True
+                first = min(max(rate[top] - rates // 2, 0), max(n_rates - rates, 0))
+                chosen[w, first : first + rates, i] = True
                 best[i] = -1.0
     return chosen
+
+
+@njit(cache=True, nogil=True)
+def carry_on(said, cheap, slope):
+    """Fill the range rates of a looked-at range that were not looked at themselves, in place.
+
+    They take the nearest looked-at one's value, less `slope` times what the cheap score falls by; (window, rate, range).
+    """
+    n_windows, n_rates, n_range = said.shape
+    for w in range(n_windows):
+        for i in range(n_range):
+            first, last = -1, -1
+            for k in range(n_rates):
+                if not np.isnan(said[w, k, i]):
+                    first = k if first < 0 else first
+                    last = k
+            if first < 0:
+                continue
+            for k in range(n_rates):
+                edge = first if k < first else last
+                if k < first or k > last:
+                    fall = max(cheap[w, edge, i] - cheap[w, k, i], np.float32(0.0))
+                    said[w, k, i] = said[w, edge, i] - np.float32(slope) * fall
 
 
 @njit(cache=True, nogil=True)

@@ -31,8 +31,8 @@ class RangeExamplesConfig:
     scale_error, speed_error : of those, standard deviations, relative.
     """
 
-    hypotheses: int = 40
-    every: int = 3
+    hypotheses: int = 24
+    every: int = 4
     empty_share: float = 0.35
     least_empty: int = 12
     shares: tuple[float, ...] = (0.45, 0.2, 0.1, 0.25)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -9,37 +11,42 @@ from torch.nn import functional
 from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeaturesConfig
 
 
+@dataclass(frozen=True)
+class RangeNetworkConfig:
+    """Widths of the encoder, of what a pair says, and of the head; dropout; the ratio lies within ±bound, smoothly."""
+
+    hidden: int = 48
+    code: int = 16
+    head: int = 48
+    dropout: float = 0.1
+    bound: float = 12.0
+
+
 class RangeNetwork(nn.Module):
     """One scorer shared by all hypotheses, ranges, rates and stations.
 
     Each pair's patch and context pass one encoder, told which pair it is; what the pairs say together, and what is said
     once, passes a small head. Pairs that cannot exist there say nothing.
-
-    Parameters
-    ----------
-    features : shape of the feature vector.
-    hidden, code, head : widths of the encoder, of what a pair says, and of the head.
-    bound : the ratio lies within ±bound, smoothly.
     """
 
     def __init__(
         self,
+        config: RangeNetworkConfig = RangeNetworkConfig(),
         features: RangeFeaturesConfig = RangeFeaturesConfig(),
-        hidden: int = 64,
-        code: int = 24,
-        head: int = 64,
-        bound: float = 12.0,
     ) -> None:
         super().__init__()
+        self.config = config
         self.patch_shape = features.patch_shape
-        self.size, self.bound = features.size, bound
+        self.size = features.size
         n_pairs, n_sub, n_lags, _ = features.patch_shape
         inputs = n_sub * n_lags * 2 + 2 * n_lags + len(CONTEXT) + n_pairs + 1
-        self.encode = nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, code), nn.SiLU())
-        said = n_pairs * code + len(GLOBALS)
-        self.judge = nn.Sequential(
-            nn.Linear(said, head), nn.SiLU(), nn.Linear(head, 32), nn.SiLU(), nn.Linear(32, 1)
+        self.encode = nn.Sequential(
+            nn.Linear(inputs, config.hidden), nn.SiLU(), nn.Linear(config.hidden, config.code), nn.SiLU()
         )
+        self.judge = nn.Sequential(
+            nn.Linear(n_pairs * config.code + len(GLOBALS), config.head), nn.SiLU(), nn.Dropout(config.dropout),
+            nn.Linear(config.head, 24), nn.SiLU(), nn.Linear(24, 1),
+        )  # fmt: skip
         self.names: Tensor
         self.register_buffer("names", torch.eye(n_pairs))
 
@@ -60,7 +67,7 @@ class RangeNetwork(nn.Module):
         said = torch.cat([patch.flatten(2), coherent, incoherent, context, named, place], dim=2)
         code = self.encode(said) * context[:, :, :1]
         score = self.judge(torch.cat([code.flatten(1), once], dim=1)).squeeze(-1)
-        return self.bound * torch.tanh(score / self.bound)
+        return self.config.bound * torch.tanh(score / self.config.bound)
 
 
 def range_loss(ratio: Tensor, log_measure: Tensor, ship: Tensor, ship_share: float) -> Tensor:

@@ -4,11 +4,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig  # noqa: E402
-from obsnet.learn.range_network import RangeNetwork, parameter_count, range_loss  # noqa: E402
+from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, parameter_count, range_loss  # noqa: E402
 
 
 def test_the_network_is_small_and_bounded():
-    network = RangeNetwork(bound=9.0)
+    network = RangeNetwork(RangeNetworkConfig(bound=9.0)).eval()
     assert parameter_count(network) < 40_000
     ratio = network(100.0 * torch.randn(7, RangeFeaturesConfig().size))
     assert ratio.shape == (7,)
@@ -16,7 +16,7 @@ def test_the_network_is_small_and_bounded():
 
 
 def test_pairs_that_do_not_exist_change_nothing():
-    config, network = RangeFeaturesConfig(), RangeNetwork()
+    config, network = RangeFeaturesConfig(), RangeNetwork().eval()
     features = torch.randn(4, config.size)
     size = int(np.prod(config.patch_shape))
     features[:, size :: len(CONTEXT)][:, :5] = torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0])

@@ -1,0 +1,258 @@
+"""The range network's training: prepared records in, ``weights.pt`` with calibration and provenance out."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+import xarray as xr
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from obsnet.config import build
+from obsnet.detectors.learned_range import RangeCalibration
+from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
+from obsnet.errors import ConfigError
+from obsnet.layout import from_posix
+from obsnet.learn.dataset import PreparedSet, Record
+from obsnet.learn.prepare import provenance
+from obsnet.learn.range_calibration import calibrate, measure
+from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
+from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, parameter_count, range_loss
+from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
+from obsnet.signals.cepstrogram import noise_std
+
+WEIGHTS = "weights.pt"
+NEEDED = (
+    "frame_time", "cepstra", "quefrency", "minute", "range_m", "range_rate_mps", "known", "path", "range",
+    "delay", "slowness", "pressure_real", "pressure_imag",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RangeTaskConfig:
+    """What the range network trains on.
+
+    Parameters
+    ----------
+    examples : how hypotheses are drawn. features : what is seen of them.
+    density_step_m : bins of the density of true ranges, which is the prior of the loss.
+    patch_noise, context_noise : standard deviations of noise added to patches and to the rest of the features in training,
+        so that no record is known again by its exact geometry.
+    """
+
+    examples: RangeExamplesConfig = field(default_factory=RangeExamplesConfig)
+    features: RangeFeaturesConfig = field(default_factory=RangeFeaturesConfig)
+    density_step_m: float = 2500.0
+    patch_noise: float = 0.3
+    context_noise: float = 0.12
+
+
+class RangeExamples(Dataset):
+    """Examples of a split of prepared sets, held in memory.
+
+    Parameters
+    ----------
+    prior : of another set's `prior`, for validation; by default that of the examples themselves.
+
+    Raises
+    ------
+    ConfigError : the sets hold no example with a ship, or none without.
+    """
+
+    def __init__(
+        self,
+        sets: Sequence[PreparedSet],
+        split: str,
+        config: RangeTaskConfig = RangeTaskConfig(),
+        prior: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        arrays = _examples(sets, split, config)
+        if not 0 < arrays["ship"].mean() < 1:
+            raise ConfigError(
+                f"the {split} records need windows with a ship in range and windows without; prepare more"
+            )
+        self.arrays = arrays
+        edges = np.append(np.arange(0.0, config.features.max_range_m, config.density_step_m), np.inf)
+        edges[-1] = config.features.max_range_m
+        self.prior = prior or (edges, range_density(arrays["range_m"][arrays["ship"], 0], edges))
+        rates = len(config.features.range_rate)
+        prior_here = log_prior(arrays["range_m"][:, 1:], *self.prior, config.features.range_step_m, rates)
+        self._log_measure = (prior_here - arrays["log_proposal"]).astype(np.float32)
+        self.ship_share = float(arrays["ship"].mean())
+
+    def __len__(self) -> int:
+        return len(self.arrays["ship"])
+
+    def __getitem__(self, item: int) -> Batch:
+        """Features (1 + hypothesis, feature), the truth first; log measure (hypothesis); whether a ship is there."""
+        return {
+            "features": torch.from_numpy(self.arrays["features"][item].astype(np.float32)),
+            "log_measure": torch.from_numpy(self._log_measure[item]),
+            "ship": torch.tensor(bool(self.arrays["ship"][item])),
+        }
+
+
+def _examples(sets: Sequence[PreparedSet], split: str, config: RangeTaskConfig) -> dict[str, np.ndarray]:
+    """Examples of a split; they take longer than an epoch to make, and are kept in the first set's folder."""
+    names = [
+        f"{name} {prepared.attributes(name)['digest']}" for prepared in sets for name in prepared.names(split)
+    ]
+    told = repr((names, config.examples, config.features))
+    path = sets[0].folder / f"range-{split}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.npz"
+    if path.is_file():
+        with np.load(path, allow_pickle=False) as held:
+            return {name: held[name] for name in FIELDS}
+    parts = [
+        range_examples(
+            cepstrogram_of(record), record.table(), truth_of(record), np.random.default_rng(number),
+            config.examples, config.features, known=known_minutes(record),
+        )
+        for number, record in enumerate(range_records(sets, split))
+    ]  # fmt: skip
+    if not parts:
+        raise ConfigError(
+            f"none of the {split} records holds a cepstrogram; prepare records with a hydrophone"
+        )
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in FIELDS}
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with open(partial, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    os.replace(partial, path)
+    return arrays
+
+
+class RangeProblem:
+    """The range network with its loss; `ship_share` of the examples have a ship."""
+
+    def __init__(self, network: RangeNetwork, ship_share: float, task: RangeTaskConfig) -> None:
+        self.network, self.ship_share, self.task = network, ship_share, task
+        shape = task.features.patch_shape
+        self._noise = torch.full((task.features.size,), task.context_noise)
+        self._noise[: int(np.prod(shape))] = task.patch_noise
+        self._noise[int(np.prod(shape)) :: len(CONTEXT)][: shape[0]] = 0.0
+
+    def loss(self, batch: Batch, training: bool, generator: torch.Generator) -> Tensor:
+        """Mean loss of a batch."""
+        features = batch["features"]
+        if training:
+            noise = self._noise * torch.randn(features.shape, generator=generator)
+            features = features + noise * (features != 0)
+        ratio = self.network(features.flatten(0, 1)).reshape(features.shape[:2])
+        return range_loss(ratio, batch["log_measure"], batch["ship"], self.ship_share).mean()
+
+
+def train(
+    sets: Sequence[PreparedSet],
+    folder: str | Path,
+    network: RangeNetworkConfig = RangeNetworkConfig(),
+    task: RangeTaskConfig = RangeTaskConfig(),
+    trainer: TrainerConfig = TrainerConfig(),
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Train, calibrate and measure on validation records; ``weights.pt`` is written, the metrics come back.
+
+    Parameters
+    ----------
+    sets : prepared sets, used together. folder : of the run. about : anything to keep with the weights.
+    """
+    examples = RangeExamples(sets, "train", task)
+    check = RangeExamples(sets, "validation", task, examples.prior)
+    made = seeded(trainer.seed, lambda: RangeNetwork(network, task.features))
+    assert isinstance(made, RangeNetwork)
+    say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameter_count(made)} parameters")
+    best = fit(RangeProblem(made, examples.ship_share, task), examples, check, folder, trainer)
+    return finish(made, sets, folder, task, trainer, {"validation_loss": best}, about, say)
+
+
+def finish(
+    network: RangeNetwork,
+    sets: Sequence[PreparedSet],
+    folder: str | Path,
+    task: RangeTaskConfig,
+    trainer: TrainerConfig,
+    found: dict[str, float],
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Calibrate a trained network on the validation records, measure it there, and write its weights."""
+    passages = [
+        (cepstrogram_of(record), record.table(), truth_of(record), known_minutes(record))
+        for record in range_records(sets, "validation")
+    ]
+    calibration = calibrate(network, passages, task.features)
+    found = found | {
+        f"validation_{k}": v for k, v in measure(network, passages, calibration, task.features).items()
+    }
+    description = {
+        "task": "range",
+        "network": asdict(network.config),
+        "features": asdict(task.features),
+        "examples": asdict(task.examples),
+        "trainer": asdict(trainer),
+        "calibration": asdict(calibration),
+        "metrics": found,
+        "data_digest": " ".join(prepared.digest() for prepared in sets),
+        "made": provenance(trainer),
+        **(about or {}),
+    }
+    save_weights(Path(folder) / WEIGHTS, network, description)
+    for name, value in found.items():
+        say(f"{name} {value:.4g}")
+    return found
+
+
+def restored(path: str | Path) -> tuple[RangeNetwork, RangeCalibration, RangeFeaturesConfig, dict[str, Any]]:
+    """Network, calibration, features and description of a run's ``weights.pt``."""
+    state, about = load_weights(path)
+    features = build(RangeFeaturesConfig, about["features"])
+    network = RangeNetwork(build(RangeNetworkConfig, about["network"]), features)
+    network.load_state_dict(state)
+    network.eval()
+    return network, build(RangeCalibration, about["calibration"]), features, about
+
+
+def range_records(sets: Sequence[PreparedSet], split: str) -> Iterator[Record]:
+    """Records of a split that hold a cepstrogram, one by one."""
+    for prepared in sets:
+        yield from (record for record in prepared.records(split, NEEDED) if record.cepstra.size)
+
+
+def cepstrogram_of(record: Record) -> xr.DataArray:
+    """The clutter-filtered cepstrogram of a prepared record."""
+    quefrency = record.quefrency
+    nfft = 2 * (quefrency.size - 1)
+    values = record.cepstra.astype(np.float32).T * noise_std(quefrency, nfft).astype(np.float32)[:, None]
+    coords = {"quefrency": quefrency, "time": from_posix(record.frame_time)}
+    return xr.DataArray(values, dims=("quefrency", "time"), coords=coords, attrs={"nfft": nfft})
+
+
+def truth_of(record: Record) -> pd.DataFrame:
+    """Ships of a prepared record whose place is known, as `range_examples` takes them."""
+    there = np.isfinite(record.range_m) & record.known
+    minute, ship = np.nonzero(there)
+    return pd.DataFrame(
+        {
+            "time": from_posix(record.minute[minute]),
+            "mmsi": ship,
+            "range_m": record.range_m[there].astype(float),
+            "range_rate_mps": record.range_rate_mps[there].astype(float),
+        }
+    )
+
+
+def known_minutes(record: Record) -> np.ndarray:
+    """Minutes in which the place of every ship is known, s since 1970; with absence unknown, those with a ship."""
+    known = (np.isfinite(record.range_m) & record.known) | (np.isnan(record.range_m) & record.known)
+    complete = known.all(axis=1)
+    if not record.absence_known:
+        complete &= (np.isfinite(record.range_m) & record.known).any(axis=1)
+    return record.minute[complete]
