@@ -24,7 +24,6 @@ from obsnet.detectors.analytic import (
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
 from obsnet.detectors.background import BackgroundDirection
 from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, presence, window_bounds
-from obsnet.detectors.model_card import shipped
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -39,6 +38,7 @@ from obsnet.trackers.segmentation import SegmentationConfig
 
 if TYPE_CHECKING:
     from obsnet.detectors.learned import LearnedAzimuthDetector
+    from obsnet.detectors.learned_range import LearnedRangeDetector
     from obsnet.trackers.station_focalization import StationFocalization, StationScans
 
 LONG_SILENCE_S = 86400.0
@@ -353,9 +353,11 @@ def _learned_azimuth(config: RunConfig) -> LearnedAzimuthDetector:
 
 def _range_detector(
     config: RunConfig, table: xr.Dataset, amplitudes: Amplitudes, threads: int | None
-) -> AnalyticRangeDetector:
+) -> AnalyticRangeDetector | LearnedRangeDetector:
     if config.detector in ("learned", "learned-range"):
-        shipped("range")
+        from obsnet.detectors.learned_range import LearnedRangeDetector
+
+        return LearnedRangeDetector.from_model(table, config.models.range, config.range, config.spectra)
     return AnalyticRangeDetector(table, amplitudes, config.range, threads)
 
 

@@ -10,18 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+from obsnet.config import build
 from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import RangeDetectorConfig, range_maps
 from obsnet.detectors.maps import coverage, window_bounds
-from obsnet.detectors.range_features import RangeFeatures, RangeFeaturesConfig
-from obsnet.errors import ConfigError
+from obsnet.detectors.model_card import ModelCard, ModelFile, check_shapes, run, shipped
+from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeatures, RangeFeaturesConfig
+from obsnet.errors import ConfigError, ModelError
 from obsnet.layout import to_posix
+from obsnet.signals.spectra import SpectraConfig
 
-BATCH = 8192
+BATCH = 4096
 CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 Scorer = Callable[[np.ndarray], np.ndarray]
@@ -38,7 +42,7 @@ class RangeCalibration:
     spread : ranges to either side of a peak at which it looks too. rates : range rates about the best one, at each range.
     slope, offset : of the network's score. cheap_slope, cheap_offset, cheap_bound : of the cheap one, and its largest value.
     lowest, highest : of the ratio, what validation supports.
-    exponent : of the ratio, because windows overlap.
+    exponent : for sums over minutes, whose windows overlap; the maps are without it.
     """
 
     peaks: int = 6
@@ -82,14 +86,44 @@ class LearnedRangeDetector:
         features: RangeFeaturesConfig = RangeFeaturesConfig(),
         config: RangeDetectorConfig = RangeDetectorConfig(),
     ) -> None:
-        if config.window_s != features.window_s:
-            raise ConfigError(
-                f"the range model was trained on windows of {features.window_s:g} s, range.window_s is {config.window_s:g}"
-            )
         self.config, self.calibration = config, calibration
         self.window_s = config.window_s
+        self.file: ModelFile | None = None
         self._scorer = scorer
         self._front = RangeFeatures(propagation, features)
+
+    @classmethod
+    def from_model(
+        cls,
+        propagation: xr.Dataset,
+        model: str | Path | None = None,
+        config: RangeDetectorConfig = RangeDetectorConfig(),
+        spectra: SpectraConfig = SpectraConfig(),
+        threads: int | None = None,
+    ) -> LearnedRangeDetector:
+        """Detector of an ONNX file; by default of the one that is shipped.
+
+        Parameters
+        ----------
+        spectra : of the frames to come. threads : of onnxruntime.
+
+        Raises
+        ------
+        ModelError : the file is not a model of ours or was altered, or it does not fit windows, frames or rate.
+        """
+        file = ModelFile.read(model or shipped("range"), "range")
+        features = build(RangeFeaturesConfig, file.card.representation["features"])
+        _check_fits(file.card, features, config, spectra)
+        session = file.session(threads or 1)
+        check_shapes(session, {"features": (None, features.size)}, (None,))
+        calibration = build(RangeCalibration, file.card.calibration)
+
+        def score(found: np.ndarray) -> np.ndarray:
+            return run(session, {"features": found})
+
+        made = cls(propagation, score, calibration, features, config)
+        made.file = file
+        return made
 
     def maps(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
         """Log-likelihood ratio against range and range rate, and its coverage, at `minutes`.
@@ -126,7 +160,7 @@ class LearnedRangeDetector:
         ratio = np.minimum(cal.cheap_slope * cheap + cal.cheap_offset, cal.cheap_bound)
         looked = np.isfinite(said)
         ratio[looked] = cal.slope * said[looked] + cal.offset
-        return cal.exponent * np.clip(ratio, cal.lowest, cal.highest)
+        return np.clip(ratio, cal.lowest, cal.highest)
 
     def scores(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the network said, NaN where it did not look, and the cheap score: (minute, rate, range) float32 both."""
@@ -144,6 +178,27 @@ class LearnedRangeDetector:
             said[cells] = self._scorer(found)
         kernels.carry_on(said, look.score, CARRIED_SLOPE)
         return said, look.score
+
+
+def _check_fits(
+    card: ModelCard, features: RangeFeaturesConfig, config: RangeDetectorConfig, spectra: SpectraConfig
+) -> None:
+    if config.window_s != features.window_s:
+        raise ModelError(
+            f"the range model was trained on windows of {features.window_s:g} s, found {config.window_s:g} s; "
+            "use --detector analytic"
+        )
+    for name in ("window_s", "hop_s", "analysis_rate_hz"):
+        trained = card.representation["spectra"][name]
+        if getattr(spectra, name) != trained:
+            raise ModelError(
+                f"the range model was trained on frames with {name} {trained:g}, found {getattr(spectra, name):g}; "
+                "use --detector analytic"
+            )
+    if tuple(card.representation["context"]) != CONTEXT or tuple(card.representation["globals"]) != GLOBALS:
+        raise ModelError(
+            "the range model was trained on other features than this obsnet makes; export it again"
+        )
 
 
 def _weights(wanted: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

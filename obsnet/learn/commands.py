@@ -57,7 +57,8 @@ def train_detector(config: DictConfig) -> float:
     from obsnet.learn.task import TrainerConfig
 
     values = plain(config)
-    prepared, folder = PreparedSet(values["prepared"]), Path(values["out"])
+    folders = values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
+    prepared, folder = PreparedSet(folders[0]), Path(values["out"])
     trainer = build(TrainerConfig, values["trainer"], "trainer")
     about = {"resolved": values}
     if values["task"] == "azimuth":
@@ -74,14 +75,21 @@ def train_detector(config: DictConfig) -> float:
             prepared, folder, network, labels, trainer, about, say, values.get("begin_with")
         )
         return found["validation_nll"]
-    raise ConfigError(f"task must be azimuth, found {values['task']!r}")
+    if values["task"] == "range":
+        from obsnet.learn import range_training
+        from obsnet.learn.range_network import RangeNetworkConfig
+
+        task = build(range_training.RangeTaskConfig, values["labels"], "labels")
+        widths = build(RangeNetworkConfig, values["network"], "network")
+        sets = [PreparedSet(name) for name in folders]
+        return range_training.train(sets, folder, widths, task, trainer, about, say)["validation_loss"]
+    raise ConfigError(f"task must be azimuth or range, found {values['task']!r}")
 
 
 def export_detector(config: DictConfig) -> None:
     """Write the ONNX file of ``config.weights`` to ``config.out`` and check it."""
-    from obsnet.learn.export import export, parity
-
     values = plain(config)
+    export, parity = _exporting(values["weights"])
     path = export(values["weights"], values["out"])
     worst = parity(values["weights"], path, values["prepared"])
     say(f"{path}: {path.stat().st_size} bytes, differs from PyTorch by {worst:.1e} at most")
@@ -89,8 +97,20 @@ def export_detector(config: DictConfig) -> None:
 
 def verify_export(config: DictConfig) -> None:
     """Check the ONNX file of ``config.out`` against ``config.weights`` on real maps."""
-    from obsnet.learn.export import parity
-
     values = plain(config)
+    _, parity = _exporting(values["weights"])
     worst = parity(values["weights"], values["out"], values["prepared"])
     say(f"{values['out']}: differs from PyTorch by {worst:.1e} at most")
+
+
+def _exporting(weights: str) -> tuple[Callable[..., Any], Callable[..., float]]:
+    """Export and its check, of the detector that the weights are of."""
+    from obsnet.learn.task import load_weights
+
+    if load_weights(weights)[1].get("task") == "range":
+        from obsnet.learn.range_export import export_range, range_parity
+
+        return export_range, range_parity
+    from obsnet.learn.export import export, parity
+
+    return export, parity

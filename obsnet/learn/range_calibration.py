@@ -121,17 +121,11 @@ def _collect(
                 for other, (r, _) in enumerate(here):
                     if other != ship:
                         masked[:, np.abs(grid - r) < max(800.0, 0.05 * r)] = -np.inf
-                corner, weight = (
-                    _corners(*here[ship], grid, rates) if len(here) else (np.zeros(4, int), np.zeros(4))
-                )
+                place = (float(here[ship, 0]), float(here[ship, 1])) if len(here) else (0.0, 0.0)
+                corner, weight = _corners(*place, grid, rates)
                 parts.append((scored[row], cheap[row], masked, corner, weight, np.array(len(here) > 0)))
-    network_said, cheap_said, log_prior, corner, weight, ship = (
-        np.stack(x) for x in zip(*parts, strict=True)
-    )
-    return _Said(
-        torch.from_numpy(network_said), torch.from_numpy(cheap_said), torch.from_numpy(log_prior.astype(np.float32)),
-        torch.from_numpy(corner), torch.from_numpy(weight.astype(np.float32)), torch.from_numpy(ship),
-    )  # fmt: skip
+    tensors = [torch.from_numpy(np.stack(column)) for column in zip(*parts, strict=True)]
+    return _Said(tensors[0], tensors[1], tensors[2].float(), tensors[3], tensors[4].float(), tensors[5])
 
 
 def _exponent(
@@ -177,7 +171,7 @@ def measure(
     calibration: RangeCalibration,
     features: RangeFeaturesConfig = RangeFeaturesConfig(),
 ) -> dict[str, float]:
-    """How well the maps serve, minute by minute, before the exponent.
+    """How well the maps serve, minute by minute.
 
     Returns
     -------
@@ -186,12 +180,13 @@ def measure(
     ece : expected calibration error of presence. minutes_with, minutes_without.
     """
     rows = []
-    single = replace(calibration, exponent=1.0)
     for cepstrogram, table, truth, known in passages:
         minutes = _inside(cepstrogram, known, features.window_s)
         if not len(minutes):
             continue
-        maps = LearnedRangeDetector(table, scorer_of(network), single, features).maps(cepstrogram, minutes)
+        maps = LearnedRangeDetector(table, scorer_of(network), calibration, features).maps(
+            cepstrogram, minutes
+        )
         ratios = presence(maps)
         said = detections(maps, ratios)
         for row, here in enumerate(_by_minute(truth, minutes, maps["range"].values[-1])):
