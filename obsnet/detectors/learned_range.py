@@ -41,6 +41,7 @@ class RangeCalibration:
     peaks : highest peaks of the cheap score, of each minute, at which the network looks.
     spread : ranges to either side of a peak at which it looks too. rates : range rates about the best one, at each range.
     slope, offset : of the network's score. cheap_slope, cheap_offset, cheap_bound : of the cheap one, and its largest value.
+    presence_slope, presence_offset : of the minute's marginal ratio of presence.
     lowest, highest : of the ratio, what validation supports.
     exponent : for sums over minutes, whose windows overlap; the maps are without it.
     """
@@ -53,6 +54,8 @@ class RangeCalibration:
     cheap_slope: float = 0.1
     cheap_offset: float = -2.0
     cheap_bound: float = 0.0
+    presence_slope: float = 1.0
+    presence_offset: float = 0.0
     lowest: float = -8.0
     highest: float = 12.0
     exponent: float = 1.0
@@ -155,12 +158,7 @@ class LearnedRangeDetector:
 
     def ratios(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> np.ndarray:
         """Calibrated log-likelihood ratios on the features' own grid, (minute, rate, range) float32."""
-        cal = self.calibration
-        said, cheap = self.scores(cepstrogram, minutes)
-        ratio = np.minimum(cal.cheap_slope * cheap + cal.cheap_offset, cal.cheap_bound)
-        looked = np.isfinite(said)
-        ratio[looked] = cal.slope * said[looked] + cal.offset
-        return np.clip(ratio, cal.lowest, cal.highest)
+        return calibrated(*self.scores(cepstrogram, minutes), self.calibration, self._front.config)
 
     def scores(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the network said, NaN where it did not look, and the cheap score: (minute, rate, range) float32 both."""
@@ -178,6 +176,36 @@ class LearnedRangeDetector:
             said[cells] = self._scorer(found)
         kernels.carry_on(said, look.score, CARRIED_SLOPE)
         return said, look.score
+
+
+def calibrated(
+    said: np.ndarray, cheap: np.ndarray, calibration: RangeCalibration, features: RangeFeaturesConfig
+) -> np.ndarray:
+    """Log-likelihood ratios from what the network said, NaN where it did not look, and the cheap score.
+
+    All are arrays (minute, rate, range). A minute's ratios are shifted together so that its marginal ratio of presence
+    becomes what validation saw; how they share it out is the network's.
+    """
+    cal = calibration
+    ratio = np.minimum(cal.cheap_slope * cheap + cal.cheap_offset, cal.cheap_bound)
+    looked = np.isfinite(said)
+    ratio[looked] = cal.slope * said[looked] + cal.offset
+    marginal = presence_ratio(ratio, features)
+    ratio += ((cal.presence_slope - 1.0) * marginal + cal.presence_offset)[:, None, None]
+    return np.clip(ratio, cal.lowest, cal.highest)
+
+
+def presence_ratio(ratio: np.ndarray, features: RangeFeaturesConfig) -> np.ndarray:
+    """Log marginal ratio of presence of ratios (minute, rate, range), by the prior of `range_prior`."""
+    weighted = (ratio + range_prior(features)).reshape(len(ratio), -1)
+    top = weighted.max(axis=1, initial=-np.inf)
+    return np.log(np.exp(weighted - top[:, None]).sum(axis=1)) + top
+
+
+def range_prior(features: RangeFeaturesConfig) -> np.ndarray:
+    """Log prior of the features' grid, in proportion to range and even over range rate: (rate, range) float32."""
+    grid, rates = np.maximum(features.range_m, features.range_m[1]), len(features.range_rate)
+    return np.broadcast_to(np.log(grid / grid.sum() / rates), (rates, len(grid))).astype(np.float32)
 
 
 def _check_fits(

@@ -23,7 +23,7 @@ from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
 from obsnet.learn.dataset import PreparedSet, Record
 from obsnet.learn.prepare import provenance
-from obsnet.learn.range_calibration import calibrate, measure
+from obsnet.learn.range_calibration import calibrate, hear, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, parameter_count, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
@@ -184,14 +184,20 @@ def finish(
     say: Callable[[str], None] = print,
 ) -> dict[str, float]:
     """Calibrate a trained network on the validation records, measure it there, and write its weights."""
-    passages = [
-        (cepstrogram_of(record), record.table(), truth_of(record), known_minutes(record))
+    scorer = scorer_of(network)
+    heard = [
+        hear(
+            scorer,
+            cepstrogram_of(record),
+            record.table(),
+            truth_of(record),
+            known_minutes(record),
+            task.features,
+        )
         for record in range_records(sets, "validation")
     ]
-    calibration = calibrate(network, passages, task.features)
-    found = found | {
-        f"validation_{k}": v for k, v in measure(network, passages, calibration, task.features).items()
-    }
+    calibration = calibrate(heard, task.features)
+    found = found | {f"validation_{k}": v for k, v in measure(heard, calibration, task.features).items()}
     description = {
         "task": "range",
         "network": asdict(network.config),
