@@ -328,7 +328,8 @@ def _duration(seconds: float) -> str:
     """Seconds in the unit that suits them."""
     units = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
     unit, size = next((u for u in units if abs(seconds) >= 2 * u[1]), ("s", 1.0))
-    return f"{seconds / size:.3g} {unit}"
+    value = seconds / size
+    return f"{value:.0f} {unit}" if abs(value) >= 100 else f"{value:.3g} {unit}"
 
 
 def _posix(text: str) -> float:
