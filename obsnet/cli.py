@@ -380,6 +380,29 @@ def serve(
     commands.serve(folder, host, port, ais)
 
 
+bench = typer.Typer(
+    help="What obsnet costs on this machine.", context_settings={"help_option_names": ["-h", "--help"]}
+)
+app.add_typer(bench, name="bench")
+
+
+@bench.callback()
+def _bench() -> None:
+    """What obsnet costs on this machine."""
+
+
+@bench.command("station")
+def bench_station(
+    detector: DetectorName = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Milliseconds a minute of data, resident memory and cold start of a live station."""
+    from obsnet.live.bench import station_cost
+
+    cost = station_cost(detector)
+    console.say(json.dumps(cost.to_json()) if as_json else cost.table())
+
+
 EXPERIMENTS = ("table1", "tkbd", "bearings", "clicks", "focalization")
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import h5netcdf
 import numpy as np
 import xarray as xr
 
@@ -91,6 +90,8 @@ class TimeWriter:
     def _create(self, block: xr.Dataset) -> Any:
         self._partial.parent.mkdir(parents=True, exist_ok=True)
         self._bytes = _PatientFile(self._partial, "w+")
+        import h5netcdf
+
         file = h5netcdf.File(self._bytes, "w")
         file.attrs["Conventions"] = "CF-1.11"
         for key, value in self._attrs.items():
@@ -166,6 +167,8 @@ def rows(values: xr.DataArray, index: np.ndarray) -> np.ndarray:
     if not path or name not in PACKED or values.variable._in_memory or not len(index):
         return values.isel(time=index).values.astype(np.float32, copy=False)
     chosen = np.empty((len(index), *values.shape[1:]), np.float32)
+    import h5netcdf
+
     with h5netcdf.File(path, "r") as file:
         packed = file.variables[name]
         if packed.shape != values.shape:
