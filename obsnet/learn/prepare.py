@@ -6,7 +6,7 @@ import functools
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +33,10 @@ from obsnet.signals.waveforms import open_waveforms
 from obsnet.twin.station import simulate
 
 
+QUIET_SEEDS = 50_000
+"""Where the seeds of the records without ships begin."""
+
+
 @dataclass(frozen=True)
 class FrontEnd:
     """The analytic path's own front end, as the records are prepared with it."""
@@ -44,11 +48,15 @@ class FrontEnd:
 
 @dataclass(frozen=True)
 class TwinData:
-    """Simulated records: how many of each split, what scenes, and AIS to take courses from (`obsea`: that package's 2012)."""
+    """Simulated records: how many of each split, how many more of the first two without ships, what scenes, and AIS to take
+    courses from (`obsea`: that package's 2012).
+    """
 
-    train: int = 150
-    validation: int = 24
-    test: int = 24
+    train: int = 180
+    validation: int = 36
+    test: int = 28
+    quiet_train: int = 50
+    quiet_validation: int = 12
     first_seed: int = 0
     courses: str | None = "obsea"
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -155,7 +163,7 @@ def _check_same(prepared: PreparedSet, data: TwinData | ArchiveData) -> None:
         return
     before = json.loads(path.read_text())["config"]
     now = json.loads(json.dumps(to_dict(data), default=str))
-    grown = ("train", "validation", "test", "end")
+    grown = ("train", "validation", "test", "quiet_train", "quiet_validation", "end")
     changed = [key for key in now if key not in grown and before.get(key) != now[key]]
     if changed:
         raise ConfigError(
@@ -173,6 +181,9 @@ def _twin_jobs(data: TwinData) -> Iterator[tuple[str, str, int]]:
     ]
     for _, split, seed in sorted(places):
         yield f"{split}-{seed:05d}", split, seed
+    for split, count in (("train", data.quiet_train), ("validation", data.quiet_validation)):
+        for i in range(count):
+            yield f"{split}-quiet-{i:05d}", split, data.first_seed + QUIET_SEEDS + i
 
 
 def _courses(name: str | None) -> pd.DataFrame | None:
@@ -191,7 +202,8 @@ def twin_record(
     name: str, split: str, seed: int, data: TwinData, courses: pd.DataFrame | None = None
 ) -> Record:
     """Simulate and prepare one record."""
-    scene = draw_scene(seed, split, data.scene, courses)
+    quiet = seed >= data.first_seed + QUIET_SEEDS
+    scene = draw_scene(seed, split, replace(data.scene, ship_shares=(1.0,)) if quiet else data.scene, courses)
     recorder = scene.scenario.recorder
     simulation = simulate(scene.scenario, scene.ocean.truth)
     horizontals = "1" in recorder.components

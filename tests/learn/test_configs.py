@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
 from obsnet.learn.prepare import ArchiveData, TwinData  # noqa: E402
 from obsnet.learn.task import TrainerConfig  # noqa: E402
 
+NOTHING = TwinData(train=0, validation=0, test=0, quiet_train=0, quiet_validation=0)
 CONFIGS = str(Path(__file__).resolve().parents[2] / "configs")
 
 
@@ -53,6 +55,6 @@ def test_a_set_is_not_mixed_with_another(tmp_path):
     from obsnet.learn.prepare import prepare
 
     with pytest.raises(ConfigError, match="no prepared record"):
-        prepare(tmp_path, TwinData(train=0, validation=0, test=0))
+        prepare(tmp_path, NOTHING)
     with pytest.raises(ConfigError, match="another first_seed"):
-        prepare(tmp_path, TwinData(train=0, validation=0, test=0, first_seed=5))
+        prepare(tmp_path, replace(NOTHING, first_seed=5))
