@@ -32,7 +32,6 @@ from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
 from obsnet.twin.station import simulate
 
-
 QUIET_SEEDS = 50_000
 """Where the seeds of the records without ships begin."""
 
