@@ -107,18 +107,17 @@ class LearnedAzimuthDetector:
         Dataset of azimuth_llr (time, azimuth) float32, azimuth_coverage (time) float32.
         """
         ambiguity = 360 if self._held is None else self._held.ambiguity_deg
-        ratio = np.full((len(minutes), int(self.card.grids["azimuths"])), np.nan, np.float32)
+        llr = np.full((len(minutes), len(self.config.azimuth)), np.nan, np.float32)
         row, place = np.divmod(np.rint(minutes / STEP_S).astype(np.int64), self._minutes)
         for number in np.unique(row):
             inside = row == number
             if self._held is not None and covered[inside].any():
-                ratio[inside] = self._row(int(number))[place[inside]]
-        llr = ratio @ self._onto[360 // ambiguity]
+                llr[inside] = self._row(int(number))[place[inside]]
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, self.config.azimuth, ambiguity)
 
     def _row(self, number: int) -> np.ndarray:
-        """Ratios of a row of minutes, (minute, azimuth of the model); rows begin at fixed times, so that a minute has the
+        """Ratios of a row of minutes, (minute, azimuth); rows begin at fixed times, so that a minute has the
         same place in its row however the record is cut.
         """
         assert self._held is not None
@@ -129,7 +128,7 @@ class LearnedAzimuthDetector:
             "phasor": np.stack([cells.phasor.real, cells.phasor.imag])[None].astype(np.float32),
             "doubled": np.array([float(cells.ambiguity_deg == 180)], np.float32),
         }
-        return run(self._session, feeds)[0]
+        return run(self._session, feeds)[0] @ self._onto[360 // cells.ambiguity_deg]
 
     def forget(self, before: float) -> None:
         """Let go of the cells that no window from `before` [s since 1970] on holds."""

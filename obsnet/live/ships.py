@@ -120,10 +120,11 @@ class Ships:
         quiet = quiet_until(self._presence, config.segmentation)
         needed = max(oldest, self._closed, -math.inf if quiet is None else quiet)
         store.execute("DELETE FROM tiles WHERE seconds < ?", (needed,))
-        if store.noted("grid") is None:
-            said, axes = _grid(minutes.maps)
-            store.put_arrays("grid", axes)
-            store.note("grid", said)
+        said, axes = _grid(minutes.maps)
+        held = store.noted("grid", {"variables": {}, "axes": {}})
+        if not said["variables"].keys() <= held["variables"].keys():
+            store.put_arrays("grid", store.arrays("grid") | axes)
+            store.note("grid", {part: held[part] | said[part] for part in said})
 
     def close(self, ended: bool = False) -> list[Segment]:
         """Segments that have closed and were not searched yet, in time order."""
@@ -208,9 +209,11 @@ def _maps(
     variables = {}
     for name, (dims, attrs) in said["variables"].items():
         shape = tuple(len(axes[dim]) for dim in dims[1:])
-        values = np.empty((len(opened), *shape), np.float32)
+        # a detector whose channels had not come yet, or had gone: no data
+        values = np.full((len(opened), *shape), np.nan if shape else 0.0, np.float32)
         for i, tile in enumerate(opened):
-            values[i] = netcdf.unpack(name, tile[name])
+            if name in tile:
+                values[i] = netcdf.unpack(name, tile[name])
         variables[name] = (dims, values, attrs)
     coords: dict[str, Any] = {name: (name, axes[name], attrs) for name, attrs in said["axes"].items()}
     return xr.Dataset(variables, coords | {"time": from_posix([seconds for seconds, _ in rows])})

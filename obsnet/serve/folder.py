@@ -30,6 +30,13 @@ from obsnet.trackers.track import Track
 
 DATABASE = "obsnet.sqlite"
 MOST_COLUMNS = 1440
+TRAIL_S, TRAIL_GAP_S, TRAIL_LEAP_KM = 10800.0, 300.0, 5.0
+"""What of the live estimates is drawn as one ship's way."""
+HEALTH = {
+    "source": "source", "detector": "detector", "last_packet": "last packet", "data_latency_s": "data latency",
+    "minute_delay_s": "a minute's delay", "coverage_last_hour": "coverage, last hour", "peak_memory_mb": "peak memory [MB]",
+}  # fmt: skip
+"""What of status.json is shown, and its name."""
 STRIPS = ("azimuth", "range", "spectrum")
 
 
@@ -164,16 +171,10 @@ class LiveFolder(_Folder):
         with self._database() as database:
             first, last = database.execute("SELECT min(time), max(time) FROM detections").fetchone()
         span = [_posix(first), _posix(last)] if first else [0.0, 60.0]
-        shown = (
-            "source",
-            "detector",
-            "last_packet",
-            "data_latency_s",
-            "minute_delay_s",
-            "coverage_last_hour",
-            "peak_memory_mb",
-        )
-        health = {key.replace("_", " "): status[key] for key in shown if status.get(key) is not None}
+        health = {name: status[key] for key, name in HEALTH.items() if status.get(key) is not None}
+        health |= {
+            name: _duration(health[name]) for name in ("data latency", "a minute's delay") if name in health
+        }
         health |= {f"{seed_id} until": time for seed_id, time in status.get("channels", {}).items()}
         counts = status.get("packets", {})
         if counts:
@@ -211,10 +212,13 @@ class LiveFolder(_Folder):
         numbers = [name for name in rows.columns if name != "time"]
         rows = rows.astype(dict.fromkeys(numbers, float))
         azimuth, distance = np.deg2rad(rows["azimuth_deg"]), rows["range_m"] / 1e3
+        seconds = np.array([_posix(text) for text in rows["time"]])
+        east, north = (np.asarray(distance * turn(azimuth)) for turn in (np.sin, np.cos))
+        begin = _same_ship(seconds, east, north)
         trail = {
-            "time": [_posix(text) for text in rows["time"]],
-            "east_km": _rounded(distance * np.sin(azimuth), 4),
-            "north_km": _rounded(distance * np.cos(azimuth), 4),
+            "time": seconds[begin:].tolist(),
+            "east_km": _rounded(east[begin:], 4),
+            "north_km": _rounded(north[begin:], 4),
         }
         last = {key: _number(value) for key, value in rows.iloc[-1].items()}
         known = [last.get(name) for name in ("range_m", "range_std_m", "azimuth_deg", "azimuth_std_deg")]
@@ -270,6 +274,14 @@ class LiveFolder(_Folder):
             raise LayoutError(f"cannot read {self.path / DATABASE}: {error}") from None
 
 
+def _same_ship(seconds: np.ndarray, east_km: np.ndarray, north_km: np.ndarray) -> int:
+    """Index from which on the estimate went on without a break or a leap: the ship that is heard now, three hours at most."""
+    leap = np.hypot(np.diff(east_km), np.diff(north_km)) > TRAIL_LEAP_KM
+    apart = np.flatnonzero(leap | (np.diff(seconds) > TRAIL_GAP_S)) + 1
+    recent = int(np.searchsorted(seconds, seconds[-1] - TRAIL_S))
+    return max(recent, int(apart[-1]) if len(apart) else 0)
+
+
 def _track(row: dict[str, Any], track: Track) -> dict[str, Any]:
     plain_row = {key: _number(value) for key, value in row.items()}
     return plain_row | {"span": [track.start, track.end], "shape": track_shape(track)}
@@ -310,6 +322,14 @@ def _number(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _duration(seconds: float) -> str:
+    """Seconds in the unit that suits them."""
+    units = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+    unit, size = next((u for u in units if abs(seconds) >= 2 * u[1]), ("s", 1.0))
+    value = seconds / size
+    return f"{value:.0f} {unit}" if abs(value) >= 100 else f"{value:.3g} {unit}"
 
 
 def _posix(text: str) -> float:

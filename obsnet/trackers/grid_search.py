@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from obsnet.errors import ConfigError
-from obsnet.kinematics import StraightCourse
+from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.trackers import search_kernels
 from obsnet.trackers.posterior import posterior
 from obsnet.trackers.score_maps import (
@@ -87,6 +87,15 @@ class _Level:
 
 
 MEDIUM = _Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
+TURN_DEG = 30.0
+"""How far from a known ship's azimuth sound may still be that ship's."""
+
+RANGED = 4.0
+"""Range log-likelihood ratio from which a tile has heard a known ship's range."""
+
+LOOSEST = (3600.0, 15_000.0)
+"""Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
+
 FINE = _Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
 
 
@@ -118,13 +127,13 @@ def search(
     if read is None:
         return []
     times, azimuth_llr, range_llr = read
-    finder = _Finder(maps, times, segment, delay, config, threads)
+    finder = _Finder(maps, times, delay, config, threads)
     for track in known:
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
     tracks: list[Track] = []
     # Without azimuths nothing tells a second ship from the first one's ghost ranges.
     for number in range(config.max_ships if "azimuth_llr" in maps else 1):
-        found = finder.find(azimuth_llr, range_llr, jointly=number > 0 and "azimuth_llr" in maps)
+        found = finder.find(azimuth_llr, range_llr, jointly=bool(number or known) and "azimuth_llr" in maps)
         least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
         if found is None or found.log_bayes_factor < least:
             break
@@ -141,12 +150,11 @@ class _Finder:
         self,
         maps: xr.Dataset,
         times: np.ndarray,
-        segment: Segment,
         delay: Callable[[np.ndarray], np.ndarray],
         config: GridSearchConfig,
         threads: int,
     ) -> None:
-        self.config, self.threads, self.segment = config, threads, segment
+        self.config, self.threads = config, threads
         self.origin = times[0]
         self.tiles = times - self.origin
         self.azimuth = maps["azimuth"].values if "azimuth_llr" in maps else np.arange(0.0, 360.0, 1.0)
@@ -182,10 +190,6 @@ class _Finder:
         step = config.tile_s
         edge = self.tiles[-1]
         cpa_time = np.arange(-1800.0, edge + 1800.0 + step, step)
-        # The segment's turn from closing to opening is the loudest ship's.
-        if self.segment.cpa is not None and not scores.jointly:
-            near = abs(cpa_time - (self.segment.cpa - self.origin)) <= 3600.0
-            cpa_time = cpa_time[near] if near.any() else cpa_time
         half = 1000.0 * int(config.max_cpa_range_m / 1000.0)
         cpa_range = np.arange(-half, half + 1.0, 1000.0)
         if not self.sees_course:
@@ -319,16 +323,18 @@ class _Finder:
         return float(best)
 
     def believable(self, track: Track) -> bool:
-        """Whether a track moves as a ship does, and lies within the prior rather than against its edge."""
+        """Whether a track moves as a ship does, is known well enough to be one, and lies within the prior, not against its edge."""
         config = self.config
         slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
         within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
         long_enough = track.end - track.start >= config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
+        located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
         return (
             long_enough
             and within_speed
             and within_range
+            and located
             and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
         )
 
@@ -382,13 +388,19 @@ class _Finder:
                 - np.interp(distance, self.delay_step * np.arange(len(self.delay)), self.delay)
             )
         azimuth, distance, rate = track.motion.observables(emitted)
-        if azimuth_llr is not None:
-            explained = lobe(azimuth_llr, self.azimuth, azimuth)
-            azimuth_llr = np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr)
+        ranged = np.zeros(len(self.tiles), bool)
         if range_llr is not None:
             near = abs(self.range_m[None, :] - distance[:, None]) <= 3000.0
             rates = abs(self.rate[None, :] - rate[:, None]) <= 3.0
-            range_llr = np.where(near[:, :, None] & rates[:, None, :], np.minimum(range_llr, 0.0), range_llr)
+            here = near[:, :, None] & rates[:, None, :]
+            ranged = np.where(here, range_llr, -np.inf).max(axis=(1, 2)) > RANGED
+            range_llr = np.where(here, np.minimum(range_llr, 0.0), range_llr)
+        if azimuth_llr is not None:
+            # A ship that keeps its range but not its azimuth has turned: what is heard nearby is still that ship.
+            explained = lobe(azimuth_llr, self.azimuth, azimuth, TURN_DEG)
+            beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= TURN_DEG
+            explained |= beside & ranged[:, None]
+            azimuth_llr = np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr)
         return azimuth_llr, range_llr
 
 

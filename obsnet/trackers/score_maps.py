@@ -68,7 +68,7 @@ def range_scores(
 
 
 def lobe(
-    llr: np.ndarray, azimuth: np.ndarray, centre: np.ndarray, reach: float = 30.0, core: float = 10.0
+    llr: np.ndarray, azimuth: np.ndarray, centre: np.ndarray, reach: float, core: float = 10.0
 ) -> np.ndarray:
     """The part of each azimuth row that a ship at `centre` explains: on both sides down to the first valley.
 

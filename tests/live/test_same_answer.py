@@ -45,6 +45,20 @@ def test_tracks_of_a_closed_segment_are_the_batch_tracks(live, hour, batch, tmp_
     assert shape["features"][0]["geometry"]["type"] == "LineString"
 
 
+def test_horizontals_that_come_late_still_give_a_course(live, hour, tmp_path):
+    begin = hour[0].stats.starttime.ns / 1e9
+    early = [
+        p
+        for p in packets(hour, lambda: 10.0)
+        if p.seed_id.endswith("BDH") or p.start_ns / 1e9 - begin > 600.0
+    ]
+    made = sorted(early, key=lambda p: p.end_ns)
+    live().run(Given([made[i : i + 4] for i in range(0, len(made), 4)]), once=True)
+    (line,) = (tmp_path / "live" / "tracks.csv").read_text().splitlines()[1:]
+    course, std = (float(line.split(",")[i]) for i in (6, 10))
+    assert abs(course - 60.0) < 5.0 + 3.0 * std
+
+
 def test_packets_beyond_the_latency_are_counted_and_cost_only_their_minutes(live, hour, batch, tmp_path):
     made = packets(hour, lambda: 10.0)
     lost = [

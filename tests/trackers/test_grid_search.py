@@ -115,11 +115,11 @@ def test_lobe_of_a_ship_ends_where_anothers_begins():
     row = 10.0 * np.exp(-0.5 * ((azimuth - 100.0) / 6.0) ** 2) + 8.0 * np.exp(
         -0.5 * ((azimuth - 125.0) / 4.0) ** 2
     )
-    explained = lobe(row[None].astype(np.float32) - 1.0, azimuth, np.array([98.0]))[0]
+    explained = lobe(row[None].astype(np.float32) - 1.0, azimuth, np.array([98.0]), 30.0)[0]
     assert explained[88:109].all()
     assert not explained[118:].any() and not explained[:68].any()
     assert (
-        lobe(np.full((1, 360), 5.0), azimuth, np.array([1.0]))[0].nonzero()[0]
+        lobe(np.full((1, 360), 5.0), azimuth, np.array([1.0]), 30.0)[0].nonzero()[0]
         == [*range(32), *range(331, 360)]
     ).all()
 

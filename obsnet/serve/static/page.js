@@ -8,6 +8,9 @@ const state = {
   found: { tracks: [], live: null, ais: [] }, detections: { time: [], azimuth_deg: [], range_m: [] }, maps: { time: [], strips: {} },
 };
 
+// A station rewrites its status every minute.
+const SILENT_S = 300;
+
 const clock = (seconds) => stamp(seconds).slice(11, 16);
 const day = (seconds) => stamp(seconds).slice(0, 10);
 const finite = (value) => value !== null && value !== undefined;
@@ -60,7 +63,9 @@ function head() {
     ? `${degrees(station.latitude, "NS")}, ${degrees(station.longitude, "EW")} · ${Math.round(station.depth_m)} m deep` : "";
   $("version").textContent = about.obsnet;
   const last = about.span[1] > 60 ? `${day(about.span[1])} ${clock(about.span[1])} UTC` : "no minute yet";
+  const told = about.status_time ? Date.parse(about.status_time) / 1000 : null;
   if (!about.healthy || about.trouble) tell("bad", about.trouble || "not healthy");
+  else if (told && Date.now() / 1000 - told > SILENT_S) tell("bad", `no word from the station since ${day(told)} ${clock(told)} UTC`);
   else if (about.kind === "live") tell("well", `live · last minute ${last}`);
   else tell("", `finished run · until ${last}`);
   $("health").replaceChildren(...Object.entries(about.health).map(([name, value]) => {
@@ -173,7 +178,7 @@ function legend() {
 }
 
 function select(number) {
-  state.selected = number === state.selected ? number : number;
+  state.selected = number;
   list();
   details();
   draw();
