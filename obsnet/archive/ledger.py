@@ -29,6 +29,7 @@ import obspy
 
 import obsnet
 from obsnet.config import to_dict
+from obsnet.detectors.model_card import ModelFile, shipped
 from obsnet.errors import ConfigError, OutputError
 from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import RunConfig
@@ -97,7 +98,8 @@ class Ledger:
 
         Raises
         ------
-        ConfigError : it was begun with other parameters, or with other metadata of a station.
+        ConfigError : it was begun with other parameters or models, or with other metadata of a station.
+        ModelError : a learned detector is asked for that is not there, or was altered.
         OutputError : it cannot be written, or another process is at work in it.
         """
         prepare_folder(self.folder)
@@ -122,7 +124,7 @@ class Ledger:
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
     def _match(self, config: RunConfig, inventories: dict[str, Any]) -> None:
-        path = self.folder / "archive.json"
+        path, digests = self.folder / "archive.json", model_digests(config)
         held: dict[str, Any] = {}
         if path.exists():
             try:
@@ -132,7 +134,8 @@ class Ledger:
                 raise ConfigError(
                     f"{path} is not one of obsnet archive; give another output folder"
                 ) from None
-            changed = _first_change(before, json.loads(json.dumps(to_dict(config))))
+            now = json.loads(json.dumps(to_dict(config))) | {"model digests": digests}
+            changed = _first_change(before | {"model digests": held.get("models", {})}, now)
             if changed:
                 raise ConfigError(
                     f"{self.folder} was begun with {changed}; give the same parameters, or another output folder"
@@ -149,8 +152,22 @@ class Ledger:
                     "give the same StationXML, or another output folder"
                 )
             write_text(self.station_file(code), text.decode())
-        about = {"obsnet": obsnet.__version__, "config": to_dict(config), "stations": stations}
+        about = {
+            "obsnet": obsnet.__version__,
+            "config": to_dict(config),
+            "models": digests,
+            "stations": stations,
+        }
         write_text(path, json.dumps(held | about, indent=1))
+
+
+def model_digests(config: RunConfig) -> dict[str, str]:
+    """SHA-256 of the model of each learned detector that a configuration uses."""
+    tasks = {"learned": ("azimuth", "range"), "learned-azimuth": ("azimuth",), "learned-range": ("range",)}
+    return {
+        task: ModelFile.read(getattr(config.models, task) or shipped(task), task).digest
+        for task in tasks.get(config.detector, ())
+    }
 
 
 def put(frame: Any, path: Path) -> int:

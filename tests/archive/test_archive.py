@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,24 @@ def test_other_parameters_or_metadata_are_refused_and_nothing_is_lost(command, s
     status, _, errors = command(sds, out, "--stations", other)
     assert status == 2 and "metadata of XX.SIM01" in errors[0]
     assert {path for path in before if path.exists()} == set(before)
+
+
+def test_a_model_that_was_exchanged_is_refused(sds, record, tmp_path, config):
+    from obsnet.archive.ledger import Ledger, model_digests
+    from obsnet.errors import ConfigError
+
+    learned = replace(config, detector="learned-azimuth")
+    (digest,) = model_digests(learned).values()
+    assert len(digest) == 64 and model_digests(config) == {}
+    with Ledger(tmp_path).begun(learned, {}):
+        pass
+    known = json.loads((tmp_path / "archive.json").read_text())
+    (tmp_path / "archive.json").write_text(json.dumps(known | {"models": {"azimuth": "another"}}))
+    with (
+        pytest.raises(ConfigError, match=r"begun with model digests\.azimuth"),
+        Ledger(tmp_path).begun(learned, {}),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(
