@@ -78,7 +78,8 @@ def main() -> None:
         print(f"processor seconds: one worker {one[1]:.1f}, two workers {two[1]:.1f}")
         print(
             f"a station-day: {report['seconds'].median():.1f} s, {report['bytes'].median() / 1e6:.1f} MB; "
-            f"processor, tracking and start included, {one[1] / arguments.days:.1f} s"
+            f"processor, tracking and start included, {one[1] / arguments.days:.1f} s; "
+            f"greatest process {resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024:.0f} MB"
         )
 
 
