@@ -90,3 +90,12 @@ def test_a_signal_ends_it_cleanly(record, tmp_path, number):
     running.send_signal(number)
     assert running.communicate(timeout=30) == (b"", b"")
     assert running.returncode == 0
+
+
+def test_the_configuration_of_the_docs_is_one(tmp_path, obsnet, record):
+    text = (ROOT / "docs" / "station.md").read_text(encoding="utf-8")
+    (yaml,) = [part.split("```")[0] for part in text.split("```yaml\n")[1:]]
+    (tmp_path / "station.yaml").write_text(yaml)
+    given = ("watch", tmp_path, "--station", record / "station.xml", "--out", tmp_path / "out", "--check")
+    status, _, errors = obsnet(*given, "--config", tmp_path / "station.yaml")
+    assert (status, errors) == (0, [])
