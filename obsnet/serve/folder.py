@@ -264,6 +264,9 @@ class LiveFolder(_Folder):
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
         address = f"file:{quote(str(self.path / DATABASE))}?mode=ro"
+        if not (self.path / f"{DATABASE}-wal").exists():
+            # nobody writes: without this, a database in WAL mode wants to make files beside it
+            address += "&immutable=1"
         try:
             database = sqlite3.connect(address, uri=True, timeout=5.0)
             try:

@@ -64,6 +64,46 @@ def test_the_band_holds_ninety_percent_of_drawn_courses():
     assert np.mean(np.stack(aside) < half, axis=0) == pytest.approx([0.9] * 3, abs=0.02)
 
 
+def test_the_live_way_is_one_ships(station_folder, listening):
+    from obsnet.live.store import LIVE_COLUMNS
+
+    folder, write = station_folder
+    write.minutes(40)
+    with write.store.transaction() as store:
+        for minute in (10, 20):  # the filter takes up another ship
+            time = stamp_of(minute)
+            store.put(
+                "live", LIVE_COLUMNS, [(time, 0.99, 200.0, 2.0, 19_000.0, 300.0, 20.0, 8.0, 54.0, -21.0)]
+            )
+    with listening(folder) as address:
+        live = httpx.get(f"{address}/api/tracks").json()["live"]
+        assert live["now"]["time"] == stamp_of(39) and len(live["ellipse"][0]) == 49
+        assert len(live["trail"]["time"]) == 19
+    write.store.close()
+    assert not (folder / "obsnet.sqlite-wal").exists()
+    with listening(folder) as address:
+        assert len(httpx.get(f"{address}/api/detections").json()["time"]) == 40
+
+
+def stamp_of(minute):
+    return f"2013-05-21T10:{minute:02d}:00Z"
+
+
+def test_a_database_that_is_none_is_said_in_one_line(station_folder, listening):
+    folder, write = station_folder
+    write.store.close()
+    for path in folder.glob("obsnet.sqlite*"):
+        path.unlink()
+    (folder / "obsnet.sqlite").write_bytes(b"no database at all" * 100)
+    with listening(folder) as address:
+        answer = httpx.get(f"{address}/api/tracks")
+    assert (
+        answer.status_code == 503
+        and "cannot read" in answer.json()["error"]
+        and "Traceback" not in answer.text
+    )
+
+
 def test_strips_are_the_maps(page, finished):
     import base64
 
