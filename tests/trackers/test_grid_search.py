@@ -81,6 +81,15 @@ def test_one_ship_gives_one_track_and_ghosts_none():
     assert len(tracks) == 1
 
 
+def test_a_detector_that_prefers_any_ship_to_none_gives_no_further_ship():
+    """Log-likelihood ratios against no ship are positive at all azimuths where a loud ship is heard."""
+    truth = StraightCourse(T0 + 7000.0, 12_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(8))
+    bend = 1.5 * np.cos(np.deg2rad(2.0 * (AZIMUTH - 100.0)))
+    maps["azimuth_llr"] += (5.0 + bend).astype(np.float32)
+    assert len(search(maps, SEGMENT, delay)) == 1
+
+
 def test_two_ships_at_once_are_two_tracks():
     ships = [
         StraightCourse(T0 + 6000.0, 12_000.0, 60.0, 9.0),
