@@ -149,8 +149,10 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     """Negative log posterior of what is there, per minute (row, minute).
 
     With a ship at θ: −log(π(θ) e^{l(θ)} / (1 + Σ π e^l)), with none: −log(1 / (1 + Σ π e^l)), π the prior of an azimuth over
-    that of no ship. Where several ships are there each is asked for alone, without the sectors of the others; the sectors of
-    ships beyond reach say nothing. At its minimum l is the log-likelihood ratio, the prior of the training draws removed.
+    that of no ship. Where several ships are there each is asked for alone, without the sectors of the others. Beside ships, too,
+    it is asked whether the rest of the circle is empty: else a loud ship, which no minute without one resembles, would lift the
+    ratio everywhere. The sectors of ships beyond reach say nothing. At its minimum l is the log-likelihood ratio, the prior of
+    the training draws removed.
     """
     count = ratio.shape[-1]
     log_prior = float(np.log(config.prior_odds / count))
@@ -171,11 +173,12 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     closed = (others | silent[:, :, None]) & ~own
     scores = ratio + log_prior
     evidence = torch.nn.functional.softplus(_logsumexp(scores[:, :, None].masked_fill(closed, -torch.inf)))
-    nothing = torch.nn.functional.softplus(_logsumexp(scores.masked_fill(silent, -torch.inf)))
+    taken = silent | (beside & here[..., None]).any(2)
+    nothing = torch.nn.functional.softplus(_logsumexp(scores.masked_fill(taken, -torch.inf)))
     asked = evidence - at_turn(scores, batch["turn"])
     number = here.sum(2)
     with_ship = (asked * here).sum(2) / number.clamp(min=1)
-    return torch.where(number > 0, with_ship, nothing)
+    return with_ship + nothing
 
 
 def _logsumexp(values: Tensor) -> Tensor:

@@ -88,7 +88,8 @@ def test_the_loss_is_the_posterior_written_out():
     none = minute_losses(ratio, labels([0.0], [ABSENT]), config)
     assert float(none) == pytest.approx(float(torch.log(1 + odds)), rel=1e-5)
     one = minute_losses(ratio, labels([0.25], [HERE]), config)
-    expected = -torch.log(0.5 / 60 * ratio[0, 0, 15].exp() / (1 + odds))
+    rest = torch.cat([ratio[0, 0, :12], ratio[0, 0, 19:]]).exp().sum()
+    expected = -torch.log(0.5 / 60 * ratio[0, 0, 15].exp() / (1 + odds)) + torch.log(1 + 0.5 / 60 * rest)
     assert float(one) == pytest.approx(float(expected), rel=1e-4)
 
 
@@ -103,6 +104,15 @@ def test_the_sector_of_an_unknown_ship_says_nothing():
     torch.testing.assert_close(minute_losses(loud, two, config), minute_losses(ratio, two, config))
 
 
+def test_a_loud_ship_does_not_lift_the_rest_of_the_circle():
+    config, batch = AzimuthTaskConfig(), labels([0.25], [HERE])
+    ratio = torch.full((1, 1, 60), -3.0)
+    ratio[0, 0, 15] = 12.0
+    lifted = ratio.clone()
+    lifted[0, 0, 30:] = 3.0
+    assert float(minute_losses(lifted, batch, config)) > 2 + float(minute_losses(ratio, batch, config))
+
+
 def test_two_ships_are_two_peaks():
     config = AzimuthTaskConfig()
     batch = labels([0.25, 0.75], [HERE, HERE])
@@ -114,24 +124,25 @@ def test_two_ships_are_two_peaks():
 
 
 def test_the_trained_ratio_is_a_likelihood_ratio():
-    """Cells of a known density: gradient descent on free ratios must find the Bayes factor of the two hypotheses."""
+    """One azimuth of twelve, a symptom of known chances: gradient descent must find the Bayes factor of a ship there."""
     generator = torch.Generator().manual_seed(1)
     odds, count = 0.8, 20_000
     ship = torch.rand(count, generator=generator) < odds / (1 + odds)
     symptom = torch.rand(count, generator=generator) < torch.where(ship, 0.9, 0.2)
     free = torch.zeros(2, requires_grad=True)
-    optimiser = torch.optim.LBFGS([free], max_iter=50)
+    optimiser = torch.optim.LBFGS([free], max_iter=50, line_search_fn="strong_wolfe")
     batch = labels(np.zeros((count, 1)), np.where(ship, HERE, ABSENT), rows=count)
 
     def closure():
         optimiser.zero_grad()
-        ratio = free[symptom.long()][:, None, None].expand(count, 1, 12)
+        others = torch.full((count, 1, 11), -30.0)
+        ratio = torch.cat([free[symptom.long()][:, None, None], others], 2)
         value = minute_losses(ratio, batch, AzimuthTaskConfig(prior_odds=odds, beside_deg=1.0)).mean()
         value.backward()
         return value
 
     optimiser.step(closure)
-    np.testing.assert_allclose(free.detach(), np.log([0.1 / 0.8, 0.9 / 0.2]), atol=0.1)
+    np.testing.assert_allclose(free.detach(), np.log([12 * 0.1 / 0.8, 12 * 0.9 / 0.2]), atol=0.1)
 
 
 def test_augmentation_keeps_what_the_rows_say():
