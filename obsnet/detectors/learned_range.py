@@ -28,6 +28,8 @@ from obsnet.signals.spectra import SpectraConfig
 BATCH = 4096
 CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
+END_SLOPE = 0.1
+"""Slope of a minute's ratio of presence beyond the strongest evidence that validation held."""
 Scorer = Callable[[np.ndarray], np.ndarray]
 """Feature vectors (n, size) float32 in, log likelihood ratios (n) float32 out."""
 
@@ -41,7 +43,7 @@ class RangeCalibration:
     peaks : highest peaks of the cheap score, of each minute, at which the network looks.
     spread : ranges to either side of a peak at which it looks too. rates : range rates about the best one, at each range.
     slope, offset : of the network's score. cheap_slope, cheap_offset, cheap_bound : of the cheap one, and its largest value.
-    presence_slope, presence_offset : of the minute's marginal ratio of presence.
+    presence_said, presence_seen : increasing knots between which a minute's marginal ratio of presence is put right.
     lowest, highest : of the ratio, what validation supports.
     exponent : for sums over minutes, whose windows overlap; the maps are without it.
     """
@@ -54,13 +56,18 @@ class RangeCalibration:
     cheap_slope: float = 0.1
     cheap_offset: float = -2.0
     cheap_bound: float = 0.0
-    presence_slope: float = 1.0
-    presence_offset: float = 0.0
+    presence_said: tuple[float, ...] = (0.0, 1.0)
+    presence_seen: tuple[float, ...] = (0.0, 1.0)
     lowest: float = -8.0
     highest: float = 12.0
     exponent: float = 1.0
 
     def __post_init__(self) -> None:
+        knots = self.presence_said, self.presence_seen
+        if len(knots[0]) != len(knots[1]) or len(knots[0]) < 2 or any(np.any(np.diff(k) <= 0) for k in knots):
+            raise ConfigError(
+                f"presence needs as many increasing knots said as seen, two at least; found {knots}"
+            )
         counts, signs = min(self.peaks, self.rates, self.spread + 1) >= 1, self.lowest < 0 < self.highest
         if not (counts and signs and self.slope > 0 and 0 < self.exponent <= 1):
             raise ConfigError(
@@ -191,7 +198,10 @@ def calibrated(
     looked = np.isfinite(said)
     ratio[looked] = cal.slope * said[looked] + cal.offset
     marginal = presence_ratio(ratio, features)
-    ratio += ((cal.presence_slope - 1.0) * marginal + cal.presence_offset)[:, None, None]
+    said_at, seen_at = np.array(cal.presence_said), np.array(cal.presence_seen)
+    slope = np.where(marginal < said_at[0], 1.0, END_SLOPE)
+    beyond = slope * (marginal - np.clip(marginal, said_at[0], said_at[-1]))
+    ratio += (np.interp(marginal, said_at, seen_at) + beyond - marginal)[:, None, None]
     return np.clip(ratio, cal.lowest, cal.highest)
 
 

@@ -37,15 +37,21 @@ def speaking(command: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any
 def prepare_records(config: DictConfig) -> None:
     """Prepare the records of ``config.data`` into ``config.out``."""
     from obsnet.learn.prepare import ArchiveData, TwinData, prepare
+    from obsnet.learn.range_records import HydrophoneData, prepare_hydrophone
 
     values = plain(config)
     data = dict(values["data"])
-    kinds = {"twin": TwinData, "archive": ArchiveData}
+    kinds = {"twin": TwinData, "archive": ArchiveData, "hydrophone": HydrophoneData}
     kind = data.pop("kind", None)
     if kind not in kinds:
         raise ConfigError(f"data.kind must be one of {', '.join(kinds)}, found {kind!r}")
     with progress("prepare", quiet=False) as draw:
-        made = prepare(values["out"], build(kinds[kind], data, "data"), draw)
+        wanted: Any = build(kinds[kind], data, "data")
+        made = (
+            prepare_hydrophone(values["out"], wanted, draw)
+            if isinstance(wanted, HydrophoneData)
+            else prepare(values["out"], wanted, draw)
+        )
     say(f"{len(made.names())} records in {made.folder}")
 
 

@@ -25,6 +25,7 @@ from obsnet.learn.calibration import INDEPENDENT_MIN, calibration_error
 from obsnet.learn.range_network import RangeNetwork
 
 STRETCH_S = 1200.0
+PRESENCE_BINS, LEAST_SLOPE = 12, 0.05
 CHEAP_STEP, CHEAP_BINS = 0.5, 80
 SCALES = np.geomspace(0.6, 1.6, 25)
 """Ranges, over the true one, of the wrong tracks that the exponent is fitted against."""
@@ -107,11 +108,11 @@ def calibrate(
         start, slope=float(np.exp(slope)), offset=offset, cheap_slope=float(np.exp(cheap_slope)), cheap_offset=cheap_offset,
         lowest=-100.0, highest=100.0,
     )  # fmt: skip
-    presence_slope, presence_offset = _presence(heard, features, fitted)
+    said, seen = _presence(heard, features, fitted)
     spans = sum(np.ptp(record.minutes) for record in heard if len(record.minutes))
     evidence = float(np.log(max(spans / 60.0 / INDEPENDENT_MIN, 10.0)))
     fitted = replace(
-        fitted, presence_slope=presence_slope, presence_offset=presence_offset,
+        fitted, presence_said=said, presence_seen=seen,
         lowest=-evidence, highest=evidence + float(np.log(len(features.range_m))),
     )  # fmt: skip
     return replace(fitted, exponent=_exponent(heard, features, fitted))
@@ -119,29 +120,39 @@ def calibrate(
 
 def _presence(
     heard: Sequence[Heard], features: RangeFeaturesConfig, calibration: RangeCalibration
-) -> tuple[float, float]:
-    """Slope and offset of the marginal ratio of presence, by logistic regression."""
-    marginal = np.concatenate(
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Knots of the marginal ratio of presence: what was said in bins of equal number, and what was seen, made to increase."""
+    said = np.concatenate(
         [
             presence_ratio(calibrated(record.network, record.cheap, calibration, features), features)
             for record in heard
         ]
     )
-    seen = torch.tensor([len(ships) > 0 for record in heard for ships in record.ships])
-    said, odds = torch.from_numpy(marginal).float(), _odds(seen)
-    free = torch.tensor([0.0, 0.0], requires_grad=True)
-    optimiser = torch.optim.LBFGS([free], max_iter=40, line_search_fn="strong_wolfe")
+    seen = np.array([len(ships) > 0 for record in heard for ships in record.ships])
+    odds = _odds_of(float(seen.mean()))
+    bins = np.array_split(np.argsort(said), PRESENCE_BINS)
+    count = np.array([len(b) for b in bins])
+    share = (np.array([seen[b].sum() for b in bins]) + seen.mean()) / (count + 1.0)
+    steps = isotonic(np.log(share / (1.0 - share)) - odds, count)
+    knots = np.array([said[b].mean() for b in bins])
+    tilt = LEAST_SLOPE * (knots - np.average(knots, weights=count))
+    apart = np.concatenate([[True], np.diff(knots) > 1e-6])
+    return tuple(map(float, knots[apart])), tuple(map(float, (steps + tilt)[apart]))
 
-    def closure() -> Tensor:
-        optimiser.zero_grad()
-        value = torch.nn.functional.binary_cross_entropy_with_logits(
-            free[0].exp() * said + free[1] + odds, seen.float()
-        )
-        value.backward()
-        return value
 
-    optimiser.step(closure)
-    return float(free[0].detach().exp()), float(free[1].detach())
+def isotonic(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Least-squares non-decreasing fit: neighbours that decrease are pooled.
+
+    >>> isotonic(np.array([1.0, 3.0, 2.0, 5.0]), np.ones(4)).tolist()
+    [1.0, 2.5, 2.5, 5.0]
+    """
+    blocks: list[tuple[float, float, int]] = []
+    for value, weight in zip(values, weights, strict=True):
+        blocks.append((float(value), float(weight), 1))
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            (a, wa, na), (b, wb, nb) = blocks[-2:]
+            blocks[-2:] = [((a * wa + b * wb) / (wa + wb), wa + wb, na + nb)]
+    return np.concatenate([np.full(n, value) for value, _, n in blocks])
 
 
 def measure(

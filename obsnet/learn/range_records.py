@@ -3,20 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from obsnet.kinematics import StraightCourse
+from obsnet.layout import to_posix
+from obsnet.learn.dataset import PreparedSet, Record, packed_table
 from obsnet.learn.oceans import Ocean, OceanSpread, draw_ocean
-from obsnet.signals.cepstrogram import ClutterFilter, cepstrogram
+from obsnet.learn.prepare import provenance
+from obsnet.signals.cepstrogram import ClutterFilter, cepstrogram, noise_std
 from obsnet.signals.spectra import spectra
 from obsnet.signals.station import Station
 from obsnet.twin.course import Course, TurningCourse
 from obsnet.twin.scenario import DEFAULT_START, Passage, Scenario
 from obsnet.twin.ship import Ship
 from obsnet.twin.station import simulate
+
+
+@dataclass(frozen=True)
+class HydrophoneData:
+    """Simulated records of the hydrophone alone: how many of each split, and their length. Labels are the twin's truth."""
+
+    train: int = 160
+    validation: int = 50
+    hours: float = 5.0
+
+
+FIRST_SEEDS = {"train": 0, "validation": 10_000}
 
 
 @dataclass(frozen=True)
@@ -92,3 +109,63 @@ def _draw_course(generator: np.random.Generator, hours: float) -> Course:
         return straight
     when = DEFAULT_START + 3600.0 * float(generator.uniform(0.2, 0.8)) * hours
     return TurningCourse(straight, when, float(generator.choice([-1, 1]) * generator.uniform(15.0, 90.0)))
+
+
+def prepare_hydrophone(folder: str | Path, data: HydrophoneData, progress: Any = None) -> PreparedSet:
+    """Make the records that are not there yet, and write provenance.
+
+    Parameters
+    ----------
+    folder : of the set. progress : called with (done, total).
+    """
+    prepared = PreparedSet(folder)
+    prepared.folder.mkdir(parents=True, exist_ok=True)
+    prepared.write_provenance(provenance(data))
+    jobs = [(split, FIRST_SEEDS[split] + k) for split in FIRST_SEEDS for k in range(getattr(data, split))]
+    for done, (split, seed) in enumerate(jobs, 1):
+        name = f"range-{split}-{seed:05d}"
+        if not prepared.has(name):
+            prepared.write(hydrophone_record(name, split, draw_record(seed, data.hours)))
+        if progress is not None:
+            progress(done, len(jobs))
+    prepared.write_provenance(
+        provenance(data) | {"digest": prepared.digest(), "records": len(prepared.names())}
+    )
+    return prepared
+
+
+def hydrophone_record(name: str, split: str, made: RangeRecord) -> Record:
+    """A simulated record as a prepared set holds it, without what the horizontals hear."""
+    cepstra, truth = made.cepstrogram, made.minutes
+    quefrency, times = cepstra["quefrency"].values, to_posix(cepstra["time"].values)
+    sigma = noise_std(quefrency, int(cepstra.attrs["nfft"])).astype(np.float32)
+    minute = np.arange(np.ceil(times[0] / 60.0), times[-1] // 60.0 + 1) * 60.0
+    ships = np.unique(truth["mmsi"])
+    place = np.full((2, len(minute), len(ships)), np.nan, np.float32)
+    for column, ship in enumerate(ships):
+        rows = truth[truth["mmsi"] == ship]
+        at = np.rint((to_posix(rows["time"].to_numpy("datetime64[ns]")) - minute[0]) / 60.0).astype(int)
+        inside = (at >= 0) & (at < len(minute))
+        place[:, at[inside], column] = rows[["range_m", "range_rate_mps"]].to_numpy()[inside].T
+    arrays = {
+        "frame_time": times,
+        "cepstra": np.clip(cepstra.values.T / sigma, -1e4, 1e4).astype(np.float16),
+        "quefrency": quefrency,
+        "minute": minute,
+        "azimuth_deg": np.full(place.shape[1:], np.nan, np.float32),
+        "range_m": place[0],
+        "range_rate_mps": place[1],
+        "known": np.ones(place.shape[1:], bool),
+    }
+    facts = {"source_levels_db": [passage.ship.source_level_db for passage in made.scenario.passages]}
+    attributes = {
+        "id": name,
+        "split": split,
+        "source": "twin",
+        "station": made.scenario.recorder.code,
+        "depth_m": float(made.ocean.believed.attrs["depth_m"]),
+        "ambiguity_deg": 360,
+        "absence_known": True,
+        "scene": facts,
+    }
+    return Record(attributes, arrays | packed_table(made.ocean.believed))

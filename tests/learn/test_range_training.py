@@ -8,11 +8,13 @@ zarr = pytest.importorskip("zarr")
 from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration, presence_ratio  # noqa: E402
 from obsnet.detectors.range_features import RangeFeaturesConfig  # noqa: E402
 from obsnet.errors import ConfigError, ModelError  # noqa: E402
+from obsnet.layout import from_posix  # noqa: E402
 from obsnet.learn.dataset import PreparedSet, Record, packed_table  # noqa: E402
 from obsnet.learn.range_calibration import Heard, calibrate, measure  # noqa: E402
 from obsnet.learn.range_examples import RangeExamplesConfig  # noqa: E402
 from obsnet.learn.range_export import export_range, range_parity  # noqa: E402
 from obsnet.learn.range_network import RangeNetworkConfig  # noqa: E402
+from obsnet.learn.range_records import HydrophoneData, prepare_hydrophone  # noqa: E402
 from obsnet.learn.range_training import (  # noqa: E402
     RangeTaskConfig,
     cepstrogram_of,
@@ -106,6 +108,18 @@ def test_records_give_back_what_was_heard_and_known(prepared):
     assert len(truth_of(part)) == 30
     silent = Record(held.attributes | {"absence_known": False}, prepared.read("r1").arrays)
     assert len(known_minutes(silent)) == 0
+
+
+def test_hydrophone_records_are_prepared_once(tmp_path, monkeypatch):
+    data = HydrophoneData(train=1, validation=1, hours=0.5)
+    made = prepare_hydrophone(tmp_path, data)
+    assert made.names("train") == ["range-train-00000"]
+    held = made.read("range-validation-10000")
+    assert cepstrogram_of(held).sizes["quefrency"] == 513
+    assert set(truth_of(held)["time"].to_numpy()) <= set(from_posix(held.minute))
+    assert len(known_minutes(held)) == len(held.minute)
+    monkeypatch.setattr("obsnet.learn.range_records.draw_record", None)
+    assert prepare_hydrophone(tmp_path, data).digest() == made.digest()
 
 
 def test_sets_without_ships_are_refused(tmp_path):
