@@ -28,6 +28,7 @@ from obsnet.twin.station import simulate
 pytest.importorskip("pyarrow")
 pytest.importorskip("distributed")
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
 MIDNIGHT = obspy.UTCDateTime(2013, 5, 22)
 
 

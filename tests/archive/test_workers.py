@@ -15,6 +15,7 @@ from obsnet.archive.workers import SINGLE_THREADED, WorkerDied, local_workers
 pytest.importorskip("pyarrow")
 distributed = pytest.importorskip("distributed")
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
 
 
 def results(tasks, brings=()):
