@@ -43,7 +43,6 @@ class Report:
     folder: Path
     rows: pd.DataFrame
     computed: int = 0
-    seconds: float = 0.0
 
     @property
     def failed(self) -> pd.DataFrame:

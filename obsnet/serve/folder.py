@@ -69,10 +69,6 @@ class _Folder:
         shapes = (ship_shape(ship, start, end) for ship in self.ships)
         return [shape for shape in shapes if shape is not None]
 
-    def tracks(self) -> list[dict[str, Any]]:
-        """All tracks: numbers as in tracks.csv, and shapes to draw."""
-        raise NotImplementedError
-
 
 class RunFolder(_Folder):
     """A finished run, read once."""
