@@ -56,8 +56,8 @@ class RangeCalibration:
     cheap_slope: float = 0.1
     cheap_offset: float = -2.0
     cheap_bound: float = 0.0
-    presence_said: tuple[float, ...] = (0.0, 1.0)
-    presence_seen: tuple[float, ...] = (0.0, 1.0)
+    presence_said: tuple[float, ...] = (-100.0, 100.0)
+    presence_seen: tuple[float, ...] = (-100.0, 100.0)
     lowest: float = -8.0
     highest: float = 12.0
     exponent: float = 1.0

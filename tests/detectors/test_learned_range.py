@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import RangeDetectorConfig
-from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration
+from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration, presence_ratio
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
@@ -126,3 +128,15 @@ def test_calibrations_that_cannot_be_are_refused():
         RangeCalibration(lowest=1.0)
     with pytest.raises(ConfigError, match="peaks"):
         RangeCalibration(peaks=0)
+
+
+def test_presence_goes_through_its_knots(table, cepstra):
+    plain = RangeCalibration(lowest=-100.0, highest=100.0)
+    said = presence_ratio(LearnedRangeDetector(table, energies, plain).ratios(cepstra, MINUTES), FEATURES)
+    low, high = float(said.min()), float(said.max())
+    bent = replace(plain, presence_said=(low, high), presence_seen=(-1.0, 2.0))
+    after = LearnedRangeDetector(table, energies, bent).ratios(cepstra, MINUTES)
+    seen = presence_ratio(after, FEATURES)
+    np.testing.assert_allclose(seen, -1.0 + 3.0 * (said - low) / (high - low), atol=1e-3)
+    with pytest.raises(ConfigError, match="increasing knots"):
+        replace(plain, presence_said=(1.0, 0.0))
