@@ -50,6 +50,11 @@ def packets(stream, seconds):
     return made
 
 
+def by_eight(made):
+    """Packets in batches of eight."""
+    return [made[i : i + 8] for i in range(0, len(made), 8)]
+
+
 @pytest.fixture(scope="session")
 def station(record):
     return Station.from_stationxml(record / "station.xml")

@@ -9,7 +9,7 @@ import pytest
 
 from obsnet.live.sources import Folder
 
-from .conftest import Given, differences, packets, rows
+from .conftest import Given, by_eight, differences, packets, rows
 
 
 def arrivals(made, delay, rng, latency=55.0):
@@ -69,7 +69,7 @@ def test_packets_beyond_the_latency_are_counted_and_cost_only_their_minutes(live
     rest = sorted((p for p in made if p not in lost), key=lambda p: p.end_ns)
     late = [*rest[:700], *lost, *rest[700:]]
     station = live()
-    station.run(Given([[p] for p in late]), once=True)
+    station.run(Given(by_eight(late)), once=True)
     assert station.buffer.counts["late"] == len(lost) == 2
     got, expected = rows(tmp_path / "live"), rows(batch)
     share = [[float(row.split(",")[1]) for row in table] for table in (got, expected)]
@@ -91,9 +91,7 @@ def test_repeated_and_foreign_packets_change_nothing(live, hour, batch, tmp_path
     foreign = [replace(p, seed_id="ZZ.OTHER.00.BHZ", start_ns=p.start_ns + 10**16) for p in made[::50]]
     mixed = doubled + foreign
     station = live()
-    station.run(
-        Given([[p] for p in sorted(mixed, key=lambda p: p.end_ns % 10**16 + rng.random())]), once=True
-    )
+    station.run(Given(by_eight(sorted(mixed, key=lambda p: p.end_ns % 10**16 + rng.random()))), once=True)
     assert differences(rows(tmp_path / "live"), rows(batch)) == []
     assert station.buffer.counts["repeated"] + station.buffer.counts["late"] == len(made)
     assert station.buffer.counts["unknown"] == len(foreign)

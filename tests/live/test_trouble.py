@@ -10,7 +10,7 @@ from obsnet.live.packets import RecordStream
 from obsnet.pipeline import RunConfig
 from obsnet.run import detections_csv
 
-from .conftest import SMALL, Given, differences, packets, rows
+from .conftest import SMALL, Given, by_eight, differences, packets, rows
 
 
 def in_order(stream, seconds=10.0):
@@ -25,7 +25,7 @@ def test_a_channel_that_stops_costs_itself_alone(live, hour, station, table, tmp
     stopped = hour.copy()
     (trace,) = stopped.select(channel="BDH")
     trace.trim(endtime=trace.stats.starttime + 1500)
-    live().run(Given([[p] for p in in_order(stopped)]), once=True)
+    live().run(Given(by_eight(in_order(stopped))), once=True)
     run = obsnet.detect(stopped, station, build(RunConfig, SMALL), table=table, threads=1)
     expected = detections_csv(run.detections).splitlines()[1:]
     assert differences(rows(tmp_path / "live"), expected) == []
@@ -37,7 +37,7 @@ def test_a_gap_of_hours_has_its_rows(live, hour, station, table, tmp_path):
     parted = hour.slice(begin, begin + 1200) + hour.slice(begin + 1800, begin + 3600).copy()
     for trace in parted[4:]:
         trace.stats.starttime += 3 * 3600.0
-    live().run(Given([[p] for p in in_order(parted)]), once=True)
+    live().run(Given(by_eight(in_order(parted))), once=True)
     run = obsnet.detect(parted, station, build(RunConfig, SMALL), table=table, threads=1)
     expected = detections_csv(run.detections).splitlines()[1:]
     assert len(expected) > 200
@@ -49,7 +49,7 @@ def test_a_clock_that_is_set_forward_leaves_a_gap(live, hour, tmp_path):
     half = len(made) // 2
     ahead = [*made[:half], *(shifted(p, 21600.0) for p in made[half:])]
     station = live()
-    station.run(Given([[p] for p in ahead]), once=True)
+    station.run(Given(by_eight(ahead)), once=True)
     said = rows(tmp_path / "live")
     assert said[0].startswith("2013-05-21T10:3")
     assert said[-1].startswith("2013-05-21T17:2")
@@ -67,10 +67,10 @@ def test_a_clock_that_is_set_back_begins_a_new_record(live, hour, tmp_path, monk
     monkeypatch.setattr("obsnet.live.station.time.monotonic", lambda: now[0])
 
     def tick(number):
-        now[0] += 3.0
+        now[0] += 24.0
 
     back = [*made[third:], *(shifted(p, -86400.0) for p in made)]
-    station.run(Given([[p] for p in back], tick), once=True)
+    station.run(Given(by_eight(back), tick), once=True)
     assert "the clock was set back" in said[0]
     days = {row[:10] for row in rows(tmp_path / "live")}
     assert days == {"2013-05-20", "2013-05-21"}
@@ -97,7 +97,7 @@ def test_packets_of_nonsense_move_nothing(live, hour, batch, tmp_path):
     for place in rng.choice(len(made), 60):
         mixed.insert(int(place), nonsense[int(rng.integers(len(nonsense)))])
     station = live()
-    station.run(Given([[p] for p in mixed]), once=True)
+    station.run(Given(by_eight(mixed)), once=True)
     assert differences(rows(tmp_path / "live"), rows(batch)) == []
 
 
