@@ -191,6 +191,12 @@ class Pipeline:
         return pd.DataFrame(table | {name: joined(name) for name in (*names, "range_rate_std_mps")})
 
     @property
+    def models(self) -> dict[str, str]:
+        """SHA-256 of the learned models in use, by task."""
+        files = {"azimuth": getattr(self._learned, "file", None), "range": getattr(self._range, "file", None)}
+        return {task: file.digest for task, file in files.items() if file is not None}
+
+    @property
     def next_minute(self) -> float | None:
         """The next minute to be finished, s since 1970; None before the first frame."""
         return self._next

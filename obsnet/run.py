@@ -176,7 +176,7 @@ def _run(
         run.live = pipeline.followed() if config.tracker == "focalization" else run.live
         run.segments, run.tracks = find_tracks(run, threads)
         clock.lap("track")
-    run.info = _describe(run, source, clock)
+    run.info = _describe(run, source, clock) | {"models": pipeline.models}
     if amplitudes is not None:
         run.info["amplitudes"] = amplitudes.to_dict()
     return run
@@ -385,7 +385,6 @@ def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
         "start": iso(source.begin_ns / 1e9),
         "end": iso(source.end_ns / 1e9),
         "config": to_dict(run.config),
-        "models": {},
         "segments": [
             {"start": iso(s.start), "end": iso(s.end), "cpa": None if s.cpa is None else iso(s.cpa)}
             for s in run.segments

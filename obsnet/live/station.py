@@ -332,7 +332,9 @@ class LiveStation:
         """Digest of all that the stored memory depends on."""
         place = (self.station.code, self.station.latitude, self.station.longitude, self.station.depth_m)
         config = {key: value for key, value in to_dict(self.config).items() if key != "live"}
-        said = json.dumps([obsnet.__version__, place, config], sort_keys=True, default=str)
+        said = json.dumps(
+            [obsnet.__version__, place, config, self.pipeline.models], sort_keys=True, default=str
+        )
         return hashlib.sha256(said.encode()).hexdigest()
 
     def _restore(self) -> None:
@@ -409,7 +411,7 @@ class LiveStation:
             },
             "source": None if source is None else source.name,
             "detector": self.config.detector,
-            "models": getattr(self.pipeline, "models", {}),
+            "models": self.pipeline.models,
             **self.health.said(head, "" if source is None else source.trouble),
             "last_sample": None if head is None else iso(head / 1e9),
             "channels": {

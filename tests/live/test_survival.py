@@ -9,12 +9,17 @@ import time
 import numpy as np
 import pytest
 
+import obsnet
+from obsnet.config import build
 from obsnet.errors import ConfigError, OutputError
 from obsnet.live import files
+from obsnet.live.config import WatchConfig
 from obsnet.live.station import LiveStation
 from obsnet.live.store import Store, from_bytes, to_bytes
+from obsnet.pipeline import RunConfig
+from obsnet.run import detections_csv
 
-from .conftest import Given, differences, packets, rows
+from .conftest import SMALL, Given, differences, packets, rows
 
 
 def in_order(hour, seconds=8.0):
@@ -61,6 +66,21 @@ def test_a_restart_goes_on_as_if_nothing_had_happened(live, hour, batch, tmp_pat
         assert json.loads((tmp_path / "live" / "status.json").read_text())["packets"]["used"] == stop
     live().run(Ring(made, {"sequence": len(made)}), once=True)
     assert differences(rows(tmp_path / "live"), rows(batch)) == []
+
+
+def test_learned_detectors_go_on_too(live, hour, station, table, tmp_path):
+    made, settings = in_order(hour), SMALL | {"detector": "learned"}
+    config = build(WatchConfig, settings)
+    run = obsnet.detect(hour, station, build(RunConfig, settings), table=table, threads=1)
+    running = live(config=config)
+    running.run(Ring(made[:700], {}))
+    running = live(config=config)
+    running.run(Ring(made, running.resume), once=True)
+    expected = detections_csv(run.detections).splitlines()[1:]
+    assert differences(rows(tmp_path / "live"), expected) == []
+    said = json.loads((tmp_path / "live" / "status.json").read_text())["models"]
+    assert said == run.info["models"] == running.pipeline.models
+    assert set(said) == {"azimuth", "range"}
 
 
 def test_a_closed_record_that_goes_on_says_its_end_again(live, hour, batch, tmp_path):
