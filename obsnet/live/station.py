@@ -82,7 +82,8 @@ class LiveStation:
         self._builder: SpectraBuilder | None = None
         self._pending: list[Packet] = []
         self._snapshot_frame: int | None = None
-        self._rested = self._fresh_at = time.monotonic()
+        self._rested = time.monotonic()
+        self._late_since: float | None = None
         self._told = -np.inf
         self._restore()
         self._look()
@@ -113,11 +114,15 @@ class LiveStation:
 
     def take(self, packets: list[Packet], patient: bool = True) -> None:
         """Take packets, and say what they finish."""
+        late, held = self.buffer.counts["late"], len(self._pending)
         for packet in packets:
             kept = self.buffer.add(packet)
             if kept is not None:
                 self._pending.append(kept)
-                self._fresh_at = time.monotonic()
+        if len(self._pending) > held:
+            self._late_since = None
+        elif self.buffer.counts["late"] > late and self._late_since is None:
+            self._late_since = time.monotonic()
         if packets:
             self.health.heard()
         first, last = self.buffer.ready()
@@ -125,7 +130,7 @@ class LiveStation:
             self._advance(first, last, patient)
         if self._pending:
             self._lasting(self._keep_pending, patient)
-        if packets and time.monotonic() - self._fresh_at > _BEHIND_S:
+        if self._late_since is not None and time.monotonic() - self._late_since > _BEHIND_S:
             self.begin_anew("packets have been late for half an hour: the clock was set back", patient)
 
     def finish(self) -> None:
@@ -159,7 +164,7 @@ class LiveStation:
         )
         self.buffer = WaveformBuffer(self.station, self.config.spectra, self.config.live)
         self._builder, self._snapshot_frame, self._pending = None, None, []
-        self._fresh_at = time.monotonic()
+        self._late_since = None
         self._lasting(self._forget, patient)
 
     # --- frames ---
