@@ -66,7 +66,8 @@ def train_detector(config: DictConfig) -> float:
     folders = values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
     prepared, folder = PreparedSet(folders[0]), Path(values["out"])
     trainer = build(TrainerConfig, values["trainer"], "trainer")
-    about = {"resolved": values}
+    places = ("prepared", "out", "weights", "begin_with")
+    about = {"resolved": values | {key: Path(values[key]).name for key in places if values.get(key)}}
     if values["task"] == "azimuth":
         from obsnet.learn import azimuth_training as training
         from obsnet.learn.azimuth import AzimuthTaskConfig
