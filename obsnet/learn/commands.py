@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -12,6 +13,15 @@ from omegaconf import DictConfig, OmegaConf
 from obsnet.config import build
 from obsnet.console import progress, say
 from obsnet.errors import ConfigError, ObsnetError
+
+PLACES = ("prepared", "out", "weights", "begin_with")
+"""Keys of files and folders, of which a run's record keeps the names alone."""
+
+
+def _names(paths: str | list[str] | None) -> Any:
+    if isinstance(paths, list):
+        return [_names(path) for path in paths]
+    return paths and Path(paths).name
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -57,8 +67,6 @@ def prepare_records(config: DictConfig) -> None:
 
 def train_detector(config: DictConfig) -> float:
     """Train (or, with ``config.weights``, adapt) the detector that ``config.task`` names; returns its validation loss."""
-    from pathlib import Path
-
     from obsnet.learn.dataset import PreparedSet
     from obsnet.learn.task import TrainerConfig
 
@@ -66,8 +74,7 @@ def train_detector(config: DictConfig) -> float:
     folders = values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
     prepared, folder = PreparedSet(folders[0]), Path(values["out"])
     trainer = build(TrainerConfig, values["trainer"], "trainer")
-    places = ("prepared", "out", "weights", "begin_with")
-    about = {"resolved": values | {key: Path(values[key]).name for key in places if values.get(key)}}
+    about = {"resolved": values | {key: _names(values.get(key)) for key in PLACES}}
     if values["task"] == "azimuth":
         from obsnet.learn import azimuth_training as training
         from obsnet.learn.azimuth import AzimuthTaskConfig
