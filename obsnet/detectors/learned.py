@@ -27,6 +27,16 @@ from obsnet.signals.spectra import SpectraConfig
 WINDOW_S, STEP_S = 180.0, 60.0
 
 
+def without_floor(llr: np.ndarray) -> np.ndarray:
+    """Azimuth maps (minute, azimuth) whose median is no evidence for a ship.
+
+    A ship raises a few tens of degrees. What raises half of all azimuths at once tells none of them from the others, yet a
+    tracker would add it up for every course: it is taken off the whole row. A floor below 0 stays.
+    """
+    floor = np.median(llr, axis=1, keepdims=True)
+    return llr - np.maximum(floor, np.float32(0.0))
+
+
 class LearnedAzimuthDetector:
     """Likelihood ratio of a ship's azimuth by a network over the azigram's cells.
 
@@ -113,6 +123,7 @@ class LearnedAzimuthDetector:
             inside = row == number
             if self._held is not None and covered[inside].any():
                 llr[inside] = self._row(int(number))[place[inside]]
+        llr = without_floor(llr)
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, self.config.azimuth, ambiguity)
 

@@ -8,7 +8,6 @@ the ship when the sound left it (paper's eq. 26, the travel time undone). The se
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from obsnet.trackers import search_kernels
 from obsnet.trackers.posterior import posterior
 from obsnet.trackers.score_maps import (
     ScoreMaps,
+    above_floor,
     azimuth_scores,
     lobe,
     polyphase,
@@ -402,12 +402,9 @@ class _Finder:
             beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= TURN_DEG
             explained |= beside & ranged[:, None]
             # Where one ship is loud, a ship anywhere may explain more than none: the next is held against the first.
-            rest = np.where(explained, np.float32(np.nan), azimuth_llr)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # rows without data
-                level = np.nanquantile(rest, 0.9, axis=1, keepdims=True)
-            rest = azimuth_llr - np.fmax(level, 0.0).astype(np.float32)
-            azimuth_llr = np.where(explained, np.minimum(azimuth_llr, 0.0), rest)
+            azimuth_llr = above_floor(
+                np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr), explained
+            )
         return azimuth_llr, range_llr
 
 

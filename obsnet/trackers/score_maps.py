@@ -91,6 +91,22 @@ def lobe(
     return out
 
 
+def above_floor(
+    llr: np.ndarray, explained: np.ndarray, share: float = 0.2, margin: float = 3.0
+) -> np.ndarray:
+    """Azimuth rows without the floor that a known ship leaves beyond its lobe, for the search of the next ship.
+
+    A loud ship lifts a learned map everywhere a little: each azimuth alone is then likelier than no ship at all, which says nothing
+    of a second one. Off comes what all but `share` of the unexplained azimuths reach and `margin` nats, where that is above 0.
+    """
+    ordered = np.sort(np.where(explained, np.inf, llr), axis=1)
+    count = np.sum(~explained, axis=1)
+    rank = np.clip(np.round((1.0 - share) * count).astype(int), 0, np.maximum(count - 1, 0))
+    floor = np.where(count > 0, ordered[np.arange(len(llr)), rank], 0.0)
+    lowered = llr - np.maximum(np.nan_to_num(floor + margin, posinf=0.0), 0.0)[:, None]
+    return np.where(explained, llr, lowered).astype(llr.dtype)
+
+
 def polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -> tuple[np.ndarray, float]:
     """Azimuth rows laid out so that the courses of one hypothesis are neighbours in memory."""
     if course_step < step:
