@@ -94,8 +94,11 @@ def train_detector(config: DictConfig) -> float:
         from obsnet.learn.range_network import RangeNetworkConfig
 
         task = build(range_training.RangeTaskConfig, values["labels"], "labels")
-        widths = build(RangeNetworkConfig, values["network"], "network")
         sets = [PreparedSet(name) for name in folders]
+        if values.get("weights"):
+            found = range_training.finetune(sets, folder, values["weights"], task, trainer, about, say)
+            return min(found["loss_before"], found["loss_after"])
+        widths = build(RangeNetworkConfig, values["network"], "network")
         return range_training.train(sets, folder, widths, task, trainer, about, say)["validation_loss"]
     raise ConfigError(f"task must be azimuth or range, found {values['task']!r}")
 

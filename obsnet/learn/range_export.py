@@ -39,7 +39,9 @@ def export_range(weights: str | Path, out: str | Path) -> Path:
             "network": asdict(network.config),
             "parameters": parameter_count(network),
             "versions": about["made"]["versions"],
-            "trained_on": "simulated records of obsnet's twin",
+            "trained_on": "simulated records of obsnet's twin"
+            if "finetune" not in about
+            else "simulated records, then a station's own passages",
         },
     )
     out = Path(out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 import xarray as xr
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
 from obsnet.config import build
 from obsnet.detectors.learned_range import RangeCalibration
@@ -30,6 +30,8 @@ from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weig
 from obsnet.signals.cepstrogram import noise_std
 
 WEIGHTS = "weights.pt"
+SHIP_SHARE = 0.82
+"""Of the examples of the shipped model, those with a ship."""
 NEEDED = (
     "frame_time", "cepstra", "quefrency", "minute", "range_m", "range_rate_mps", "known", "path", "range",
     "delay", "slowness", "pressure_real", "pressure_imag",
@@ -61,10 +63,11 @@ class RangeExamples(Dataset):
     Parameters
     ----------
     prior : of another set's `prior`, for validation; by default that of the examples themselves.
+    empty : whether examples without a ship must be among them; a real archive seldom knows of any.
 
     Raises
     ------
-    ConfigError : the sets hold no example with a ship, or none without.
+    ConfigError : the sets hold no example with a ship, or none without where there must be.
     """
 
     def __init__(
@@ -73,12 +76,13 @@ class RangeExamples(Dataset):
         split: str,
         config: RangeTaskConfig = RangeTaskConfig(),
         prior: tuple[np.ndarray, np.ndarray] | None = None,
+        empty: bool = True,
     ) -> None:
         arrays = _examples(sets, split, config)
-        if not 0 < arrays["ship"].mean() < 1:
-            raise ConfigError(
-                f"the {split} records need windows with a ship in range and windows without; prepare more"
-            )
+        ships = int(arrays["ship"].sum())
+        if not ships or (empty and ships == len(arrays["ship"])):
+            others = " and windows without" if empty else ""
+            raise ConfigError(f"the {split} records need windows with a ship in range{others}; prepare more")
         self.arrays = arrays
         edges = np.append(np.arange(0.0, config.features.max_range_m, config.density_step_m), np.inf)
         edges[-1] = config.features.max_range_m
@@ -170,7 +174,53 @@ def train(
     assert isinstance(made, RangeNetwork)
     say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameter_count(made)} parameters")
     best = fit(RangeProblem(made, examples.ship_share, task), examples, check, folder, trainer)
-    return finish(made, sets, folder, task, trainer, {"validation_loss": best}, about, say)
+    return finish(
+        made, sets, folder, task, trainer, {"validation_loss": best}, about, say, examples.ship_share
+    )
+
+
+def finetune(
+    sets: Sequence[PreparedSet],
+    folder: str | Path,
+    weights: str | Path,
+    task: RangeTaskConfig = RangeTaskConfig(),
+    trainer: TrainerConfig = TrainerConfig(epochs=4, batch=64, learning_rate=3e-4, weight_decay=1e-2),
+    about: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Adapt trained weights to a station; the old ones are kept where the new are not better on held-out passages.
+
+    The held-out passages are the validation split's. Calibration and share of windows with a ship stay as they were: a handful
+    of passages says nothing of the sea without ships.
+    """
+    network, _, features, before = restored(weights)
+    task = replace(task, features=features)
+    examples = RangeExamples(sets, "train", task, empty=False)
+    check = RangeExamples(sets, "validation", task, examples.prior, empty=False)
+    problem = RangeProblem(network, float(before.get("ship_share", SHIP_SHARE)), task)
+    old = {name: values.clone() for name, values in network.state_dict().items()}
+    loss_before = _held_out_loss(problem, check)
+    fit(problem, examples, check, folder, trainer)
+    loss_after = _held_out_loss(problem, check)
+    better = loss_after < loss_before
+    if not better:
+        network.load_state_dict(old)
+    verdict = "kept the new weights" if better else "kept the old weights"
+    say(f"held-out passages: {loss_before:.4f} nats a window before, {loss_after:.4f} after; {verdict}")
+    found = {"loss_before": loss_before, "loss_after": loss_after, "adapted": float(better)}
+    digests = " ".join(prepared.digest() for prepared in sets)
+    told = {"set": provenance(task), "data_digest": digests, **found, **(about or {})}
+    save_weights(Path(folder) / WEIGHTS, network, before | {"finetune": told})
+    return found
+
+
+def _held_out_loss(problem: RangeProblem, examples: RangeExamples) -> float:
+    problem.network.eval()
+    generator, total = torch.Generator(), 0.0
+    with torch.no_grad():
+        for batch in DataLoader(examples, 64):
+            total += float(problem.loss(batch, False, generator)) * len(batch["ship"])
+    return total / len(examples)
 
 
 def finish(
@@ -182,6 +232,7 @@ def finish(
     found: dict[str, float],
     about: dict[str, Any] | None = None,
     say: Callable[[str], None] = print,
+    ship_share: float = SHIP_SHARE,
 ) -> dict[str, float]:
     """Calibrate a trained network on the validation records, measure it there, and write its weights."""
     scorer = scorer_of(network)
@@ -206,6 +257,7 @@ def finish(
         "trainer": asdict(trainer),
         "calibration": asdict(calibration),
         "metrics": found,
+        "ship_share": ship_share,
         "data_digest": " ".join(prepared.digest() for prepared in sets),
         "made": provenance(trainer),
         **(about or {}),

@@ -18,6 +18,7 @@ from obsnet.learn.range_records import HydrophoneData, prepare_hydrophone  # noq
 from obsnet.learn.range_training import (  # noqa: E402
     RangeTaskConfig,
     cepstrogram_of,
+    finetune,
     known_minutes,
     restored,
     train,
@@ -94,6 +95,22 @@ def test_the_exported_model_says_the_same_and_detects(trained, prepared, tmp_pat
     assert np.isfinite(maps["range_llr"].values).all()
     with pytest.raises(ModelError, match="hop_s"):
         LearnedRangeDetector.from_model(held.table(), model, spectra=SpectraConfig(hop_s=5.12))
+
+
+def test_adapting_keeps_what_is_better_and_needs_no_empty_sea(trained, prepared, tmp_path):
+    ships = PreparedSet(tmp_path / "archive")
+    for name in ("r0", "r2"):
+        ships.write(prepared.read(name))
+    trainer = TrainerConfig(epochs=1, batch=8, learning_rate=1e-3)
+    found = finetune([ships], tmp_path / "run", trained[0], TASK, trainer, say=lambda text: None)
+    _, calibration, _, about = restored(tmp_path / "run" / "weights.pt")
+    assert calibration == restored(trained[0])[1]
+    assert about["finetune"]["adapted"] == float(found["loss_after"] < found["loss_before"])
+    wild = TrainerConfig(epochs=1, batch=8, learning_rate=30.0)
+    kept = finetune([ships], tmp_path / "wild", trained[0], TASK, wild, say=lambda text: None)
+    assert kept["adapted"] == 0.0
+    old, new = (restored(path)[0].state_dict() for path in (trained[0], tmp_path / "wild" / "weights.pt"))
+    assert all(torch.equal(old[name], new[name]) for name in old)
 
 
 def test_records_give_back_what_was_heard_and_known(prepared):
