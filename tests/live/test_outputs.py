@@ -11,6 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from obsnet.errors import OutputError
 from obsnet.live.outputs import HealthServer, NmeaOutput, metrics, sentences
+from obsnet.live.station import Health
 
 ROW = {
     "time": "2013-05-21T11:02:00Z", "existence": 0.98, "azimuth_deg": 149.93, "azimuth_std_deg": 1.0, "range_m": 6032.2,
@@ -115,6 +116,20 @@ def test_health_and_metrics(live, hour):
     assert values["obsnet_info"] == 1
     assert get("/../etc/passwd")[0] == 404
     server.close()
+
+
+def test_silence_is_trouble(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("obsnet.live.station.time.monotonic", lambda: now[0])
+    health = Health(silence_s=300.0)
+    health.heard()
+    now[0] += 299
+    assert health.said(None, "")["healthy"]
+    now[0] += 2
+    assert health.said(None, "")["trouble"] == "no packet for 301 s"
+    assert health.said(None, "Connection closed")["trouble"] == "Connection closed"
+    health.heard()
+    assert health.said(None, "")["healthy"]
 
 
 def test_metrics_carry_labels_and_digests(live):
