@@ -11,7 +11,7 @@ from obsnet import console
 from obsnet.errors import ConfigError
 
 if TYPE_CHECKING:
-    from obsnet.calibration import Calibration
+    from obsnet.ocean.amplitudes import Amplitudes
     from obsnet.pipeline import RunConfig
     from obsnet.run import Run
     from obsnet.signals.station import Station
@@ -46,19 +46,17 @@ def track(
     from obsnet.output import staged
 
     settings = run_config(config, overrides, detector, tracker, propagation)
-    station = read_station(
-        station_file, code, start, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
-        latitude=latitude, longitude=longitude,
+    station, amplitudes = _calibrated(
+        station_file, code, start, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+        depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
-    fitted = read_calibration(calibration)
-    station = fitted.apply(station) if fitted else station
     reference = read_reference(ais, station) if ais else None
     with staged(out, leftovers=("live.csv",)) as folder:
         with console.progress("reading and detecting", quiet) as progress:
             task = runs.track if tracking else runs.detect
             run = task(
                 waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-                progress=progress, amplitudes=fitted.amplitudes if fitted else None,
+                progress=progress, amplitudes=amplitudes,
             )  # fmt: skip
         runs.write_tables(run, folder)
         run.plot(folder / "report.png", reference=reference)
@@ -99,14 +97,13 @@ def watch(
         if isinstance(section, dict):
             section["latency_s"] = latency
     settings = build(WatchConfig, values)
-    station = read_station(
-        station_file, code, None, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity, depth_m=depth,
-        latitude=latitude, longitude=longitude,
+    station, amplitudes = _calibrated(
+        station_file, code, None, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+        depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
-    fitted = read_calibration(calibration)
     watch_source(
-        source, fitted.apply(station) if fitted else station, settings, out, once=once, check=check,
-        amplitudes=fitted.amplitudes if fitted else None,
+        source, station, settings, out, once=once, check=check,
+        amplitudes=amplitudes,
         say=(lambda line: None) if quiet else console.say,
     )  # fmt: skip
 
@@ -219,13 +216,17 @@ def read_station(path: Path, code: str | None, start: str | None, **overrides: A
     )
 
 
-def read_calibration(path: Path | None) -> Calibration | None:
-    """The file of ``obsnet calibrate``, if one was given."""
-    if path is None:
-        return None
+def _calibrated(
+    path: Path, code: str | None, start: str | None, calibration: Path | None, **overrides: Any
+) -> tuple[Station, Amplitudes | None]:
+    """Station and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given."""
+    station = read_station(path, code, start, **overrides)
+    if calibration is None:
+        return station, None
     from obsnet.calibration import Calibration
 
-    return Calibration.read(path)
+    fitted = Calibration.read(calibration)
+    return fitted.apply(station), fitted.amplitudes
 
 
 def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3) -> list:

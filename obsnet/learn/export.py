@@ -85,10 +85,17 @@ def azimuth_card(network: AzimuthNetwork, calibration: Calibration, about: dict[
             "azimuths": network.config.azimuths,
         },
         calibration=calibration.to_dict(),
-        metrics=about["metrics"],
-        data_digest=about["data_digest"],
-        commit=about["made"]["commit"],
-        about={
+        **origin(network, about),
+    )
+
+
+def origin(network: Any, about: dict[str, Any]) -> dict[str, Any]:
+    """What a card says of how a network of either kind came to be."""
+    return {
+        "metrics": about["metrics"],
+        "data_digest": about["data_digest"],
+        "commit": about["made"]["commit"],
+        "about": {
             "network": asdict(network.config),
             "parameters": parameters(network),
             "versions": about["made"]["versions"],
@@ -96,7 +103,7 @@ def azimuth_card(network: AzimuthNetwork, calibration: Calibration, about: dict[
             if "finetune" not in about
             else "simulated records, then a station's own passages",
         },
-    )
+    }
 
 
 def write_onnx(

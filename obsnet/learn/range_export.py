@@ -12,8 +12,7 @@ from obsnet.detectors.model_card import ModelCard, ModelFile, run
 from obsnet.detectors.range_features import CONTEXT, GLOBALS
 from obsnet.errors import ModelError
 from obsnet.learn.dataset import PreparedSet
-from obsnet.learn.export import TOLERANCE, write_onnx
-from obsnet.learn.range_network import parameter_count
+from obsnet.learn.export import TOLERANCE, origin, write_onnx
 from obsnet.learn.range_training import RangeExamples, RangeTaskConfig, restored
 from obsnet.signals.spectra import SpectraConfig
 
@@ -32,17 +31,7 @@ def export_range(weights: str | Path, out: str | Path) -> Path:
         },
         grids={"features": features.size},
         calibration=asdict(calibration),
-        metrics=about["metrics"],
-        data_digest=about["data_digest"],
-        commit=about["made"]["commit"],
-        about={
-            "network": asdict(network.config),
-            "parameters": parameter_count(network),
-            "versions": about["made"]["versions"],
-            "trained_on": "simulated records of obsnet's twin"
-            if "finetune" not in about
-            else "simulated records, then a station's own passages",
-        },
+        **origin(network, about),
     )
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -89,8 +89,3 @@ def range_loss(ratio: Tensor, log_measure: Tensor, ship: Tensor, ship_share: flo
     total = torch.logsumexp(ratio[:, 1:] + log_measure, dim=1) + odds
     evidence = functional.softplus(total)
     return evidence - torch.where(ship, ratio[:, 0] + odds, torch.zeros_like(evidence))
-
-
-def parameter_count(network: nn.Module) -> int:
-    """Trainable numbers of a network."""
-    return sum(p.numel() for p in network.parameters() if p.requires_grad)

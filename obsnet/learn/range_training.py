@@ -22,10 +22,11 @@ from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
 from obsnet.learn.dataset import PreparedSet, Record
+from obsnet.learn.networks import parameters
 from obsnet.learn.prepare import provenance
 from obsnet.learn.range_calibration import calibrate, hear, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
-from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, parameter_count, range_loss
+from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
 from obsnet.signals.cepstrogram import noise_std
 
@@ -172,7 +173,7 @@ def train(
     check = RangeExamples(sets, "validation", task, examples.prior)
     made = seeded(trainer.seed, lambda: RangeNetwork(network, task.features))
     assert isinstance(made, RangeNetwork)
-    say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameter_count(made)} parameters")
+    say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameters(made)} parameters")
     best = fit(RangeProblem(made, examples.ship_share, task), examples, check, folder, trainer)
     return finish(
         made, sets, folder, task, trainer, {"validation_loss": best}, about, say, examples.ship_share

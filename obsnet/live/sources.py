@@ -13,6 +13,7 @@ import re
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -230,7 +231,7 @@ def _ends(table: np.ndarray) -> np.ndarray:
     return table["start_ns"] + np.rint(table["count"] / table["rate"] * 1e9).astype(np.int64)
 
 
-class Queued:
+class Queued(ABC):
     """A source whose packets a thread of its own puts into a bounded queue: a slow station makes the sender wait."""
 
     def __init__(self, name: str) -> None:
@@ -275,8 +276,9 @@ class Queued:
             except queue.Full:
                 continue
 
+    @abstractmethod
     def _run(self) -> None:
-        raise NotImplementedError
+        """Put packets until there are no more or `close` is called; runs in the source's own thread."""
 
 
 class StandardInput(Queued):

@@ -4,12 +4,13 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig  # noqa: E402
-from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, parameter_count, range_loss  # noqa: E402
+from obsnet.learn.networks import parameters  # noqa: E402
+from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss  # noqa: E402
 
 
 def test_the_network_is_small_and_bounded():
     network = RangeNetwork(RangeNetworkConfig(bound=9.0)).eval()
-    assert parameter_count(network) < 40_000
+    assert parameters(network) < 40_000
     ratio = network(100.0 * torch.randn(7, RangeFeaturesConfig().size))
     assert ratio.shape == (7,)
     assert ratio.abs().max() <= 9.0
