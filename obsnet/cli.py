@@ -75,8 +75,10 @@ PropagationFile = Annotated[
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Entry point: run a command, turn expected errors into one line and exit status 2."""
-    # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # The compiled loops bring their own threads; a spinning BLAS pool on a shared CPU slows a run tenfold. Once numpy is
+    # loaded this would reach child processes alone, and they would round otherwise than their parent.
+    if "numpy" not in sys.modules:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")
     command = typer.main.get_command(app)

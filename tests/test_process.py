@@ -154,3 +154,20 @@ def test_bad_input_is_one_line_of_a_process(record, tmp_path):
         told.stderr
         == "obsnet: error: cannot read the time 'soon'; give ISO 8601, e.g. 2013-05-21T10:00:00Z\n"
     )
+
+
+@pytest.mark.parametrize(("before", "threads"), [("", "1"), ("import numpy", "None")])
+def test_children_compute_with_the_threads_of_their_parent(before, threads, monkeypatch):
+    """BLAS reads its threads once: what is set after numpy would hold for child processes alone."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    code = f"""
+{before}
+import os
+from obsnet.cli import main
+try:
+    main(["version"])
+except SystemExit:
+    pass
+print(os.environ.get("OPENBLAS_NUM_THREADS"))
+"""
+    assert python(code).stdout.split()[-1] == threads
