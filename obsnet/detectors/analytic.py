@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from obsnet.detectors import kernels
-from obsnet.detectors.maps import coverage, window_bounds
+from obsnet.detectors.maps import coverage, hop, range_axis, range_rate_axis, window_bounds
 from obsnet.errors import ConfigError
 from obsnet.layout import AZIGRAM, CEPSTROGRAM, from_posix, require, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -127,13 +127,12 @@ class RangeDetectorConfig:
     @property
     def range_m(self) -> np.ndarray:
         """Range grid [m], from 0."""
-        return np.arange(int(self.max_range_m / self.range_step_m) + 1) * self.range_step_m
+        return range_axis(self.max_range_m, self.range_step_m)
 
     @property
     def range_rate(self) -> np.ndarray:
         """Range rate grid [m/s], symmetric about 0."""
-        half = round(self.max_range_rate_mps / self.range_rate_step_mps)
-        return np.arange(-half, half + 1) * self.range_rate_step_mps
+        return range_rate_axis(self.max_range_rate_mps, self.range_rate_step_mps)
 
 
 class AnalyticAzimuthDetector:
@@ -171,9 +170,9 @@ class AnalyticAzimuthDetector:
         require(azigram, AZIGRAM)
         config = self.config
         times = to_posix(azigram["time"].values)
-        hop = _hop(times)
+        hop_s = hop(times)
         if config.mode == "tonal":
-            _check_product(config, hop)
+            _check_product(config, hop_s)
         fold = 360 // int(azigram.attrs.get("ambiguity_deg", 360))
         angle = np.deg2rad(config.azimuth) * fold
         real, imag = np.ascontiguousarray(azigram.values.real), np.ascontiguousarray(azigram.values.imag)
@@ -187,7 +186,7 @@ class AnalyticAzimuthDetector:
                 real, imag, null, start, stop, np.cos(angle), np.sin(angle), config.mean_resultant_length,
                 config.frequency_overlap_exponent, config.detection_probability, llr,
             )  # fmt: skip
-        covered = coverage(~np.isnan(real).all(axis=0), start, stop, minutes, config.window_s, hop)
+        covered = coverage(~np.isnan(real).all(axis=0), start, stop, minutes, config.window_s, hop_s)
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, config.azimuth, 360 // fold)
 
@@ -265,7 +264,7 @@ class AnalyticRangeDetector:
 
         bounds = np.unique(np.append(np.arange(0, len(minutes), 8), len(minutes)))
         _in_threads(one, list(itertools.pairwise(bounds)), self._threads)
-        covered = coverage(valid, start, stop, minutes, config.window_s, _hop(times))
+        covered = coverage(valid, start, stop, minutes, config.window_s, hop(times))
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 
@@ -454,10 +453,6 @@ def _in_threads(task: Callable, arguments: list[tuple], threads: int) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(task, *argument) for argument in arguments]:
             future.result()
-
-
-def _hop(times: np.ndarray) -> float:
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1.0
 
 
 def _check_product(config: AzimuthDetectorConfig, hop_s: float) -> None:

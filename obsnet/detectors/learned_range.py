@@ -18,7 +18,7 @@ import xarray as xr
 from obsnet.config import build
 from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import RangeDetectorConfig, range_maps
-from obsnet.detectors.maps import coverage, window_bounds
+from obsnet.detectors.maps import coverage, hop, window_bounds
 from obsnet.detectors.model_card import ModelCard, ModelFile, check_shapes, run, shipped
 from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeatures, RangeFeaturesConfig
 from obsnet.errors import ConfigError, ModelError
@@ -157,9 +157,10 @@ class LearnedRangeDetector:
             llr,
         )
         times = to_posix(cepstrogram["time"].values)
-        hop = float(np.median(np.diff(times))) if times.size > 1 else 1.0
         start, stop = window_bounds(times, minutes, config.window_s)
-        covered = coverage(~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop)
+        covered = coverage(
+            ~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop(times)
+        )
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 

@@ -42,6 +42,22 @@ def window_bounds(
     return start, stop
 
 
+def hop(frame_time: np.ndarray) -> float:
+    """Time from one frame to the next [s]; 1 where there is but one."""
+    return float(np.median(np.diff(frame_time))) if len(frame_time) > 1 else 1.0
+
+
+def range_axis(max_range_m: float, step_m: float) -> np.ndarray:
+    """Range grid [m], from 0."""
+    return np.arange(int(max_range_m / step_m) + 1) * step_m
+
+
+def range_rate_axis(max_range_rate_mps: float, step_mps: float) -> np.ndarray:
+    """Range rate grid [m/s], symmetric about 0."""
+    half = round(max_range_rate_mps / step_mps)
+    return np.arange(-half, half + 1) * step_mps
+
+
 def coverage(
     valid: np.ndarray, start: np.ndarray, stop: np.ndarray, minutes: np.ndarray, window_s: float, hop_s: float
 ) -> np.ndarray:

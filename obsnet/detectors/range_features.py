@@ -14,7 +14,7 @@ import scipy.fft
 import xarray as xr
 
 from obsnet.detectors import range_kernels as kernels
-from obsnet.detectors.maps import window_bounds
+from obsnet.detectors.maps import hop, range_axis, range_rate_axis, window_bounds
 from obsnet.errors import ConfigError
 from obsnet.layout import CEPSTROGRAM, require, to_posix
 from obsnet.ocean.rays import interpolate, parse_pair
@@ -65,13 +65,12 @@ class RangeFeaturesConfig:
     @property
     def range_m(self) -> np.ndarray:
         """Ranges of the grid of hypotheses [m]."""
-        return np.arange(int(self.max_range_m / self.range_step_m) + 1) * self.range_step_m
+        return range_axis(self.max_range_m, self.range_step_m)
 
     @property
     def range_rate(self) -> np.ndarray:
         """Range rates of the grid of hypotheses [m/s], symmetric about 0."""
-        half = round(self.max_range_rate_mps / self.range_rate_step_mps)
-        return np.arange(-half, half + 1) * self.range_rate_step_mps
+        return range_rate_axis(self.max_range_rate_mps, self.range_rate_step_mps)
 
     @property
     def patch_shape(self) -> tuple[int, int, int, int]:
@@ -251,13 +250,13 @@ def _once(
 ) -> np.ndarray:
     """Of each minute: coverage of its sub-windows, log power of its frames, log mean energy at range rate 0."""
     n_sub, length = config.sub_windows, config.window_s / config.sub_windows
-    hop = float(np.median(np.diff(times))) if times.size > 1 else 1.0
+    hop_s = hop(times)
     thinned = analytic[:, round(0.03 * analytic.shape[1]) : -1 : OVERSAMPLING]
     power = np.where(valid, (thinned.real**2 + thinned.imag**2).mean(axis=1), 0.0)
     out = np.zeros((len(minutes), n_sub + 2), np.float32)
     for w, (lo, hi) in enumerate(zip(start, stop, strict=True)):
         sub = np.clip(np.floor((times[lo:hi] - minutes[w]) / length + 0.5 * n_sub).astype(int), 0, n_sub - 1)
-        out[w, :n_sub] = np.minimum(np.bincount(sub, valid[lo:hi], n_sub) * hop / length, 1.0)
+        out[w, :n_sub] = np.minimum(np.bincount(sub, valid[lo:hi], n_sub) * hop_s / length, 1.0)
         out[w, n_sub] = np.log(max(power[lo:hi].sum() / max(valid[lo:hi].sum(), 1), 1e-3))
     still = energy[:, :, energy.shape[2] // 2]
     out[:, n_sub + 1] = np.log(np.maximum(still.mean(axis=(1, 2)), 1e-3))
