@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from pyproj import Proj
 from obsnet import netcdf
 from obsnet.detectors.maps import LikelihoodMaps
 from obsnet.errors import FilterError
-from obsnet.kinematics import StraightCourse
+from obsnet.kinematics import BentCourse, StraightCourse
 from obsnet.layout import from_posix, iso, to_posix
 from obsnet.live.config import WatchConfig
 from obsnet.live.store import LIVE_COLUMNS, Store
@@ -234,6 +235,7 @@ def _said(track: Track) -> dict[str, Any]:
         "start": track.start,
         "end": track.end,
         "motion": [motion.cpa_time, motion.cpa_range_m, motion.course_deg, motion.speed_mps],
+        "bends": [motion.reach_s, motion.across, motion.along] if isinstance(motion, BentCourse) else None,
         "covariance": [[float(v) if math.isfinite(v) else None for v in row] for row in track.covariance],
         "log_bayes_factor": track.log_bayes_factor,
         "method": track.method,
@@ -243,4 +245,8 @@ def _said(track: Track) -> dict[str, Any]:
 def _track(said: dict[str, Any]) -> Track:
     covariance = np.array([[math.inf if v is None else v for v in row] for row in said["covariance"]])
     motion = StraightCourse(*said["motion"])
+    if said.get("bends"):
+        (before, after), *terms = said["bends"]
+        across, along = (tuple((float(a), float(b)) for a, b in term) for term in terms)
+        motion = replace(BentCourse(*said["motion"]), reach_s=(before, after), across=across, along=along)
     return Track(said["start"], said["end"], motion, covariance, said["log_bayes_factor"], said["method"])

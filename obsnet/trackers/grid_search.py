@@ -1,8 +1,9 @@
-"""Likelihood maps of one segment in, straight courses out: coarse-to-fine grid search and the posterior around its best.
+"""Likelihood maps of one segment in, courses out: coarse-to-fine grid search and the posterior around its best.
 
 A hypothesis is a straight course at constant speed. Its score is the sum, over the tiles (minutes a whole window apart, so
 that no frame counts twice), of the log mixtures (1 − Pd) + Pd·likelihood ratio read off the maps where the hypothesis puts
 the ship when the sound left it (paper's eq. 26, the travel time undone). The search keeps the best hypotheses of every level.
+Around the best one the course may bend (`bends`).
 """
 
 from __future__ import annotations
@@ -10,16 +11,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from obsnet.errors import ConfigError
-from obsnet.kinematics import StraightCourse, wrap180
+from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.trackers import search_kernels
-from obsnet.trackers.posterior import posterior
+from obsnet.trackers.bends import MARGIN_S, bends
+from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import (
     ScoreMaps,
     above_floor,
@@ -39,6 +41,8 @@ class GridSearchConfig:
     `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
     and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
     reach `min_log_bayes_factor_next`, since what is left of the first is not noise. A track must be heard for `shortest_s`.
+    `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
+    to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range).
     """
 
     azimuth_detection_probability: float = 0.9
@@ -55,6 +59,7 @@ class GridSearchConfig:
     min_log_bayes_factor_next: float = 60.0
     still_deg_per_hour: float = 4.0
     shortest_s: float = 3600.0
+    range_scale_std: float = 0.005
     samples: int = 3000
     seed: int = 0
 
@@ -66,6 +71,8 @@ class GridSearchConfig:
             raise ConfigError(
                 f"min_speed_mps must lie below max_speed_mps, found {self.min_speed_mps}, {self.max_speed_mps}"
             )
+        if not 0.0 <= self.range_scale_std < 1.0:
+            raise ConfigError(f"range_scale_std must lie in [0, 1), found {self.range_scale_std}")
         for name in (
             "tile_s",
             "tile_bound",
@@ -299,15 +306,65 @@ class _Finder:
         if not self.sees_course:
             cov[2, :] = cov[:, 2] = 0.0
             cov[2, 2] = np.inf
-        motion = StraightCourse(self.origin + mean[0], float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
         method = "grid search" if self.sees_course and self.sees_range else _blind(self.sees_course)
-        start, end = self.origin + self.tiles[lo], self.origin + self.tiles[hi]
         extra = {
             "score": float(score[0]),
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }
-        return Track(float(start), float(end), motion, cov, log_bayes_factor, method, extra)
+        start, end = float(self.origin + self.tiles[lo]), float(self.origin + self.tiles[hi])
+        track = Track(
+            start, end, self._course(mean), self._of_table(cov, mean), log_bayes_factor, method, extra
+        )
+        worth = log_bayes_factor >= config.min_log_bayes_factor and self.believable(track)
+        if worth and self.sees_course and self.sees_range:
+            track = self._bent(track, known, scores)
+        return track
+
+    def _bent(self, track: Track, straight: Posterior, scores: ScoreMaps) -> Track:
+        """A believable track, its course marginalised over bends; a bent course where the data ask for it."""
+        heard = np.array(
+            [straight.mean[0] - track.start + self.origin, track.end - self.origin - straight.mean[0]]
+        )
+        reach = np.maximum(heard, 0.0) + MARGIN_S
+
+        def log_likelihood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            total, per_tile = np.empty(len(points)), np.zeros((len(self.tiles), len(points)))
+            search_kernels.score_bent_points(
+                np.ascontiguousarray(points), reach, self.tiles, self.delay, self.delay_step, scores.range_score, scores.geometry,
+                scores.azimuth_score, scores.azimuth_step, scores.jointly, per_tile, total,
+            )  # fmt: skip
+            return self.config.exponent * total, self.config.exponent * per_tile
+
+        config = self.config
+        found = bends(straight, log_likelihood, self._inside, reach, samples=config.samples, seed=config.seed)
+        mean = found.mean if found.bent else straight.mean
+        changes: dict[str, Any] = {"covariance": self._of_table(found.covariance, mean)}
+        if found.bent:
+            score, per_tile = log_likelihood(mean[None])
+            lo, hi = _best_run(per_tile[:, 0])
+            heard_share = float((per_tile[lo : hi + 1, 0] > 0).mean())
+            changes |= {
+                "start": float(self.origin + self.tiles[lo]),
+                "end": float(self.origin + self.tiles[hi]),
+                "motion": self._course(mean, reach),
+                "log_bayes_factor": track.log_bayes_factor + found.log_evidence - straight.log_evidence,
+                "extra": track.extra | {"score": float(score[0]) / config.exponent, "heard": heard_share},
+            }
+        return replace(track, **changes)
+
+    def _course(self, mean: np.ndarray, reach: np.ndarray | None = None) -> StraightCourse:
+        """The course of a hypothesis; bent where it has bends, over `reach` [s] before and after CPA."""
+        state = (self.origin + float(mean[0]), float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
+        if reach is None:
+            return StraightCourse(*state)
+        across, along = mean[4:].reshape(-1, 2, 2).transpose(1, 0, 2).tolist()
+        return BentCourse(*state, tuple(reach.tolist()), tuple(map(tuple, across)), tuple(map(tuple, along)))
+
+    def _of_table(self, covariance: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """The covariance with the propagation table's own error: it scales CPA range and speed alike."""
+        scaled = self.config.range_scale_std * np.array([0.0, mean[1], 0.0, mean[3]])
+        return covariance + (np.outer(scaled, scaled) if self.sees_range else 0.0)
 
     def _fixed_source(self, scores: ScoreMaps, lo: int, hi: int) -> float:
         """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""

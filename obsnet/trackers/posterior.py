@@ -53,7 +53,7 @@ def posterior(
     mean, cov = best.copy(), np.diag([60.0, 500.0, 3.0, 0.3]) ** 2
     log_evidence = -np.inf
     for _ in range(rounds):
-        points, log_proposal = _student(rng, mean, cov, samples, seen)
+        points, log_proposal = student(rng, mean, cov, samples, seen)
         total, per_tile = log_likelihood(points)
         log_weight = np.where(inside(points), total, -np.inf) - log_proposal
         top = log_weight.max()
@@ -64,11 +64,11 @@ def posterior(
         deviation = difference(points, mean)
         cov = (weight * deviation.T) @ deviation + np.diag(FLOOR) ** 2
     chosen = np.ix_(seen, seen)
-    cov[chosen] = _widened(cov[chosen], deviation[:, seen], weight, per_tile, block)
+    cov[chosen] = widened(cov[chosen], deviation[:, seen], weight, per_tile, block)
     return Posterior(mean, cov, log_evidence)
 
 
-def _widened(
+def widened(
     cov: np.ndarray, deviation: np.ndarray, weight: np.ndarray, per_tile: np.ndarray, block: int
 ) -> np.ndarray:
     """The covariance, widened along the directions in which blocks of tiles disagree more than it allows.
@@ -100,7 +100,7 @@ def difference(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return difference
 
 
-def _student(
+def student(
     rng: np.random.Generator,
     mean: np.ndarray,
     cov: np.ndarray,

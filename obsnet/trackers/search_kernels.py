@@ -116,6 +116,18 @@ def sum_scores(index, across, along, row, range_score, azimuth_score, jointly, o
                 out[t, i, j] = best
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _range_share(score, x, y):
+    """Score of one tile (n_range, n_rate) at a place between its nodes; off the grid is 0."""
+    a, b = int(np.floor(x)), int(np.floor(y))
+    if a < 0 or b < 0 or a >= score.shape[0] - 1 or b >= score.shape[1] - 1:
+        return 0.0
+    u, v = x - a, y - b
+    return (1 - u) * ((1 - v) * score[a, b] + v * score[a, b + 1]) + u * (
+        (1 - v) * score[a + 1, b] + v * score[a + 1, b + 1]
+    )
+
+
 @njit(cache=True, nogil=True)
 def score_points(
     points,
@@ -138,7 +150,6 @@ def score_points(
     azimuth_score : (n_tiles, n_azimuth). per_tile : (n_tiles, n) filled with each tile's share if it has n columns.
     out : (n) float64, overwritten.
     """
-    n_range, n_rate = range_score.shape[1], range_score.shape[2]
     bins = azimuth_score.shape[1]
     for p in range(points.shape[0]):
         cpa_time, cpa_range, course, speed = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
@@ -148,16 +159,79 @@ def score_points(
             emitted = _emitted(tiles[m] - cpa_time, cpa_range, speed, delay, delay_step)
             along = speed * emitted
             r = np.sqrt(cpa_range * cpa_range + along * along)
-            share = 0.0
             x = (r - geometry[0]) / geometry[1]
             y = (speed * along / max(r, 1.0) - geometry[2]) / geometry[3]
-            a, b = int(np.floor(x)), int(np.floor(y))
-            if a >= 0 and b >= 0 and a < n_range - 1 and b < n_rate - 1:
-                u, v = x - a, y - b
-                share += (1 - u) * ((1 - v) * range_score[m, a, b] + v * range_score[m, a, b + 1]) + u * (
-                    (1 - v) * range_score[m, a + 1, b] + v * range_score[m, a + 1, b + 1]
-                )
+            share = _range_share(range_score[m], x, y)
             z = ((course + np.rad2deg(np.arctan2(cpa_range, along))) % 360.0) / azimuth_step
+            c = int(np.floor(z))
+            w = z - c
+            pointing = (1 - w) * azimuth_score[m, c % bins] + w * azimuth_score[m, (c + 1) % bins]
+            if jointly and pointing <= 0:
+                share = min(share, 0.0)
+            share += pointing
+            if per_tile.shape[1] > p:
+                per_tile[m, p] = share
+            run = max(run + share, 0.0)
+            out[p] = max(out[p], run)
+
+
+@njit(cache=True, nogil=True)
+def score_bent_points(
+    points,
+    reach,
+    tiles,
+    delay,
+    delay_step,
+    range_score,
+    geometry,
+    azimuth_score,
+    azimuth_step,
+    jointly,
+    per_tile,
+    out,
+):
+    """Score of each hypothesis of a list whose courses bend (`kinematics.BentCourse`); otherwise as `score_points`.
+
+    Parameters
+    ----------
+    points : (n, 12) CPA time [s on the clock of `tiles`], signed CPA range [m], course [deg], speed [m/s], then the two terms of
+        the bends: across before and after CPA, along before and after; the same of the second term.
+    reach : (2) s before and after CPA over which the velocity departs.
+    """
+    bins = azimuth_score.shape[1]
+    for p in range(points.shape[0]):
+        cpa_time, cpa_range, course, speed = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
+        out[p] = 0.0
+        run = 0.0
+        for m in range(tiles.shape[0]):
+            heard = tiles[m] - cpa_time
+            emitted = heard
+            side, ahead, r, sideways, forwards = 0.0, 0.0, 0.0, 0.0, 0.0
+            for step in range(4):
+                k = 1 if emitted >= 0.0 else 0
+                elapsed = abs(emitted)
+                angle = 0.5 * np.pi * min(elapsed / reach[k], 1.0)
+                co, si = np.cos(angle), np.sin(angle)
+                beyond = max(elapsed - reach[k], 0.0)
+                # The second term's angle is three times the first's.
+                way = 2.0 * reach[k] / np.pi * (1.0 - co) + beyond
+                way2 = 2.0 * reach[k] / (3.0 * np.pi) * (1.0 - (4.0 * co**3 - 3.0 * co)) - beyond
+                if k == 0:
+                    way, way2 = -way, -way2
+                side = cpa_range + speed * (points[p, 4 + k] * way + points[p, 8 + k] * way2)
+                ahead = speed * (emitted + points[p, 6 + k] * way + points[p, 10 + k] * way2)
+                r = np.sqrt(side * side + ahead * ahead)
+                if step < 3:
+                    emitted = heard - _lookup(delay, delay_step, r)
+                else:
+                    si2 = 3.0 * si - 4.0 * si**3
+                    sideways = speed * (points[p, 4 + k] * si + points[p, 8 + k] * si2)
+                    forwards = speed * (1.0 + points[p, 6 + k] * si + points[p, 10 + k] * si2)
+            rate = (side * sideways + ahead * forwards) / max(r, 1.0)
+            share = _range_share(
+                range_score[m], (r - geometry[0]) / geometry[1], (rate - geometry[2]) / geometry[3]
+            )
+            z = ((course + np.rad2deg(np.arctan2(side, ahead))) % 360.0) / azimuth_step
             c = int(np.floor(z))
             w = z - c
             pointing = (1 - w) * azimuth_score[m, c % bins] + w * azimuth_score[m, (c + 1) % bins]
