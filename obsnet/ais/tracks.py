@@ -21,6 +21,7 @@ from obsnet.layout import to_posix
 
 DelayFunction = Callable[[np.ndarray], np.ndarray]
 VELOCITY_HALF_SPAN_S = 120.0
+CPA_HALF_SPAN_S = 900.0
 ATTRIBUTES = ("ship_type", "length_m", "width_m", "to_stern_m")
 
 
@@ -132,6 +133,19 @@ class ReferenceTrack:
         """
         inside = (self.time > self.starttime) & (self.time < self.endtime)
         times = np.concatenate([[self.starttime], self.time[inside], [self.endtime]])
+        east, north, _ = self.at(times)
+        return fit_straight_course(times, east, north)
+
+    def course_at_cpa(self) -> StraightCourse:
+        """The straight course fitted to the track over half an hour about its closest approach: where the ship really passed.
+
+        That of a ship that turns is far from the line through its whole crossing.
+        """
+        middle = self.cpa().time
+        low, high = max(middle - CPA_HALF_SPAN_S, self.time[0]), min(middle + CPA_HALF_SPAN_S, self.time[-1])
+        if high - low < CPA_HALF_SPAN_S:
+            return self.line()
+        times = np.linspace(low, high, 61)
         east, north, _ = self.at(times)
         return fit_straight_course(times, east, north)
 

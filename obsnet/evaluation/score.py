@@ -65,7 +65,8 @@ def evaluate(
     Returns
     -------
     Evaluation
-        Errors of the tracker are against the straight line through each ship's AIS positions. A ship is
+        Errors of the tracker are against each ship's course at its CPA (AIS of half an hour), which is what a track
+        states; and, as the core paper has them, against the straight line through all its AIS positions. A ship is
         missed when its CPA lies within the working record and no track is assigned to it within `gates`.
     """
     detections, tracks = _checked(detections, DETECTIONS, "detections"), _track_table(tracks)
@@ -77,12 +78,12 @@ def evaluate(
             for t, (start, end) in zip(reference, spans, strict=True)
             if end >= times.min() and start <= times.max()
         ]
-    lines = [track.line() for track in reference]
+    lines = [track.course_at_cpa() for track in reference]
     compared = compare(detections, reference, delay, criteria)
     matches = match_tracks(tracks, lines, gates)
     nearest = np.inf if expected_cpa_m is None else expected_cpa_m
     ships = tuple(
-        _ship(i, track, compared, tracks, matches.get(i), detections, delay, nearest)
+        _ship(i, track, lines[i], compared, tracks, matches.get(i), detections, delay, nearest)
         for i, track in enumerate(reference)
         if i in matches or abs(lines[i].cpa_range_m) <= nearest
     )
@@ -95,6 +96,7 @@ def evaluate(
         tracks=len(tracks),
         minutes=minute_scores(detections, compared),
         coverage=coverage(tracks, lines, matches),
+        against_lines=_against_lines(tracks, matches, [track.line() for track in reference]),
         notes=_notes(ships, detections, criteria),
     )
 
@@ -102,6 +104,7 @@ def evaluate(
 def _ship(
     index: int,
     track: ReferenceTrack,
+    line: StraightCourse,
     compared: Comparison,
     tracks: pd.DataFrame,
     match: int | None,
@@ -109,7 +112,6 @@ def _ship(
     delay: DelayFunction | None,
     expected_cpa_m: float,
 ) -> ShipScore:
-    line = track.line()
     minutes = to_posix(detections["time"].to_numpy("datetime64[ns]"))
     heard = minutes[compared.heard[index]]
     travel = 0.0 if delay is None else float(np.asarray(delay(np.array([abs(line.cpa_range_m)])))[0])
@@ -144,6 +146,14 @@ def _tracker_errors(tracks: pd.DataFrame, match: int, line: StraightCourse) -> d
         "speed_error_mps": speed,
         "cpa_azimuth_error_deg": float(wrap180(azimuth - line.cpa_azimuth_deg)),
     }
+
+
+def _against_lines(
+    tracks: pd.DataFrame, matches: dict[int, int], lines: list[StraightCourse]
+) -> dict[str, float]:
+    """SMAD of the matched tracks' errors against other courses of the ships."""
+    found = [_tracker_errors(tracks, row, lines[ship]) for ship, row in matches.items()]
+    return {name: smad(np.array([errors[name] for errors in found], float)) for name in TRACKER_ERRORS}
 
 
 def _total(ships: tuple[ShipScore, ...], statistics: Statistics) -> ShipScore:

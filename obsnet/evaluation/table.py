@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import pandas as pd
@@ -46,6 +46,7 @@ class Evaluation:
     false_tracks : numbers of the tracks that are no ship's.
     minutes : shares of right minutes and wrong ones per hour, for azimuth and range.
     coverage : shares of matched tracks whose stated 50 % and 90 % regions hold the truth.
+    against_lines : SMAD of the tracker's errors against the straight lines through all AIS positions, the paper's truth.
     notes : what a reader must know.
     """
 
@@ -56,6 +57,7 @@ class Evaluation:
     tracks: int
     minutes: dict[str, dict[str, float]]
     coverage: dict[str, dict[str, float]]
+    against_lines: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def to_frame(self) -> pd.DataFrame:
@@ -102,6 +104,13 @@ class Evaluation:
             f"{self.tracks} tracks: {matched} of {len(self.ships)} ships matched, {len(self.missed)} missed"
             f"{_listed(self.missed)}, {len(self.false_tracks)} false{_listed(self.false_tracks)}"
         ]
+        if matched and self.against_lines:
+            off = self.against_lines
+            lines.append(
+                "tracker against straight lines through all of each ship's AIS: "
+                f"CPA {_number(off['cpa_time_error_s'], 0)} s, course {_number(off['course_error_deg'], 1)}°, "
+                f"CPA {_number(off['cpa_distance_error_m'], 0)} m, {_number(off['speed_error_mps'], 2)} m/s"
+            )
         for name, score in self.minutes.items():
             lines.append(
                 f"{name}: right in {_percent(score['right'])} of {score['minutes']} minutes with a ship; "
