@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsnet import console
+from obsnet.beside import Beside
 from obsnet.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,15 +53,22 @@ def track(
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     reference = read_reference(ais, station) if ais else None
-    with staged(out, leftovers=("live.csv",)) as folder:
+    with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
+        report: list[Beside] = []
+
+        def draw(heard: Run) -> None:
+            task = heard.drawing(folder / "report.png", reference)
+            report.append(stack.enter_context(Beside(task, jobs)))
+
         with console.progress("reading and detecting", quiet) as progress:
             task = runs.track if tracking else runs.detect
             run = task(
                 waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-                progress=progress, amplitudes=amplitudes,
+                progress=progress, amplitudes=amplitudes, heard=draw,
             )  # fmt: skip
+        report[0].tell((run.segments, run.tracks, run.info))
         runs.write_tables(run, folder)
-        run.plot(folder / "report.png", reference=reference)
+        report[0].finish()
         console.heed()
     if not quiet:
         _summary(run, out)

@@ -83,6 +83,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str, Any]:
     """Values with `section.key=value` overrides laid over them."""
+    if not overrides:
+        return dict(values)
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError

@@ -18,6 +18,7 @@ PACKED = {"range_llr": 0.05}
 """Variables stored as 16-bit integers, and their resolution (CF `scale_factor`)."""
 
 _FILL = np.int16(-32768)
+_CELLS_AT_ONCE = 1 << 17
 
 
 class TimeWriter:
@@ -152,7 +153,11 @@ class _PatientFile(io.FileIO):
 
 def read(path: str | Path) -> xr.Dataset:
     """Open a file of `TimeWriter` lazily; pairs ``x_real``, ``x_imag`` come back as complex ``x`` when loaded."""
-    return xr.open_dataset(path, engine="h5netcdf")
+    from xarray.backends import (
+        H5netcdfBackendEntrypoint,
+    )  # by its name, xarray would import all backends that it finds
+
+    return xr.open_dataset(path, engine=H5netcdfBackendEntrypoint)
 
 
 def rows(values: xr.DataArray, index: np.ndarray) -> np.ndarray:
@@ -206,12 +211,21 @@ def pack(name: str, values: np.ndarray) -> np.ndarray:
     """Values of a variable as a file holds them."""
     if name not in PACKED:
         return values
-    scaled = np.rint(np.clip(values, -1600.0, 1600.0) / np.float32(PACKED[name]))
-    return np.where(np.isnan(scaled), np.float32(_FILL), scaled).astype(np.int16)
+    cells = np.ravel(values)
+    packed = np.empty(cells.shape, np.int16)
+    for first in range(0, len(cells), _CELLS_AT_ONCE):
+        part = slice(first, first + _CELLS_AT_ONCE)
+        scaled = np.clip(cells[part], -1600.0, 1600.0)
+        scaled /= np.float32(PACKED[name])
+        np.copyto(np.rint(scaled, out=scaled), np.float32(_FILL), where=np.isnan(scaled))
+        packed[part] = scaled
+    return packed.reshape(values.shape)
 
 
 def unpack(name: str, packed: np.ndarray) -> np.ndarray:
     """Values of a variable from what `pack` made of them."""
     if name not in PACKED:
         return packed
-    return np.where(packed == _FILL, np.float32(np.nan), packed * np.float32(PACKED[name]))
+    values = packed * np.float32(PACKED[name])
+    values[packed == _FILL] = np.nan
+    return values

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from obsnet.detectors.learned import LearnedAzimuthDetector
     from obsnet.detectors.learned_range import LearnedRangeDetector
     from obsnet.trackers.station_focalization import StationFocalization, StationScans
+
+_HORIZONTALS = {"east", "north"}
 
 LONG_SILENCE_S = 86400.0
 """A silence longer than this has no rows; the record goes on after it as if it began there."""
@@ -113,6 +116,7 @@ class Pipeline:
     config : RunConfig
     amplitudes : strength of each path pair against range; by default weak, broad curves
         scaled to the depth (`Amplitudes.broad`).
+    threads : for the detectors; all cores by default.
     table : propagation table, if it is not to be made from `config.ocean`.
     begin : s since 1970; earlier frames are heard, so that the filters have learned by then, but have no minutes.
     """
@@ -126,7 +130,7 @@ class Pipeline:
         threads: int | None = None,
         begin: float = -np.inf,
     ) -> None:
-        self.station, self.config, self.begin = station, config, begin
+        self.station, self.config, self.begin, self._threads = station, config, begin, threads
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         expected = amplitudes or Amplitudes.broad().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
@@ -161,11 +165,12 @@ class Pipeline:
         if self._next is None:
             first = max(times[0], self.begin)
             self._next = float(np.ceil(first / self.config.azimuth.step_s) * self.config.azimuth.step_s)
-        self._take(spectra)
         self._last = float(times[-1])
         ready = times[-1] - self.config.azimuth.window_s / 2
-        looks = self._learned is not None and self._azigram is not None
-        finished.append(self._finish(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s))
+        looks = self._learned is not None and (self._azigram is not None or set(spectra) >= _HORIZONTALS)
+        finished.append(
+            self._finish(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s, spectra)
+        )
         return [minutes for minutes in finished if minutes is not None]
 
     def flush(self) -> Minutes | None:
@@ -249,34 +254,16 @@ class Pipeline:
             "spectrogram": self._spectrogram,
         }
 
-    def _take(self, spectra: xr.Dataset) -> None:
-        if "east" in spectra and "north" in spectra:
-            azimuths = azigram(spectra, self.config.azigram)
-            directional = self._learned is None and self.config.azimuth.null == "directional"
-            null = self._background(azimuths) if directional else None
-            if self._learned is not None:
-                self._learned.take(spectra)
-            self._null = null if self._null is None else _join(self._null, null)
-            self._azigram = _concat(self._azigram, azimuths)
-        if "p" in spectra:
-            cepstra = self._clutter(cepstrogram(spectra))
-            self._cepstrogram = _concat(self._cepstrogram, cepstra)
-            if self._follower is not None:
-                times = to_posix(cepstra["time"].values)
-                self._followed.append(self._follower.push(cepstra.values, cepstra["quefrency"].values, times))
-        self._spectrogram = _concat(self._spectrogram, _power(spectra))
-
-    def _finish(self, ready: float) -> Minutes | None:
+    def _finish(self, ready: float, spectra: xr.Dataset | None = None) -> Minutes | None:
+        """Take the next spectra, if any, and finish the minutes up to `ready`."""
         step = self.config.azimuth.step_s
-        if self._next is None or ready < self._next - 1e-6 * step:
+        count = int(np.floor((ready - self._next) / step + 1e-6)) + 1 if self._next is not None else 0
+        minutes = (self._next or 0.0) + step * np.arange(max(count, 0))
+        if spectra is not None:
+            self._spectrogram = _concat(self._spectrogram, _power(spectra))
+        parts = [part for part in self._parts(minutes, spectra) if part is not None]
+        if not len(minutes):
             return None
-        count = int(np.floor((ready - self._next) / step + 1e-6)) + 1
-        minutes = self._next + step * np.arange(count)
-        parts = []
-        if self._azigram is not None:
-            parts.append(self._azimuth_maps(self._azigram, minutes))
-        if self._cepstrogram is not None:
-            parts.append(self._range.maps(self._cepstrogram, minutes))
         if not parts:
             raise ConfigError(
                 f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with"
@@ -293,7 +280,28 @@ class Pipeline:
         self._forget(self._next - self.config.azimuth.window_s / 2)
         return result
 
-    def _azimuth_maps(self, held: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
+    def _parts(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[xr.Dataset | None]:
+        """Azimuth and range maps, made at the same time where there are threads."""
+        if self._threads == 1:
+            return [self._azimuth_maps(minutes, spectra), self._range_maps(minutes, spectra)]
+        with ThreadPoolExecutor(1) as beside:
+            azimuth = beside.submit(self._azimuth_maps, minutes, spectra)
+            ranges = self._range_maps(minutes, spectra)
+            return [azimuth.result(), ranges]
+
+    def _azimuth_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> xr.Dataset | None:
+        """Take what the next spectra say of azimuth, and what all say of some minutes; none without horizontals."""
+        if spectra is not None and set(spectra) >= _HORIZONTALS:
+            azimuths = azigram(spectra, self.config.azigram)
+            directional = self._learned is None and self.config.azimuth.null == "directional"
+            null = self._background(azimuths) if directional else None
+            if self._learned is not None:
+                self._learned.take(spectra)
+            self._null = null if self._null is None else _join(self._null, null)
+            self._azigram = _concat(self._azigram, azimuths)
+        held = self._azigram
+        if held is None or not len(minutes):
+            return None
         if self._learned is None:
             return self._azimuth.maps(held, minutes, self._null)
         window_s, times = self.config.azimuth.window_s, to_posix(held["time"].values)
@@ -301,6 +309,18 @@ class Pipeline:
         heard = ~np.isnan(held.values).all(axis=0)
         covered = coverage(heard, *bounds, minutes, window_s, self.config.spectra.hop_s)
         return self._learned.maps(minutes, covered)
+
+    def _range_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> xr.Dataset | None:
+        """Take what the next spectra say of range, and what all say of some minutes; none without a hydrophone."""
+        if spectra is not None and "p" in spectra:
+            cepstra = self._clutter(cepstrogram(spectra))
+            self._cepstrogram = _concat(self._cepstrogram, cepstra)
+            if self._follower is not None:
+                times = to_posix(cepstra["time"].values)
+                self._followed.append(self._follower.push(cepstra.values, cepstra["quefrency"].values, times))
+        if self._cepstrogram is None or not len(minutes):
+            return None
+        return self._range.maps(self._cepstrogram, minutes)
 
     def _features(self, minutes: np.ndarray) -> xr.Dataset:
         """Spectrogram, azigram and cepstrogram thinned to one column a minute, for the eye."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -92,9 +92,15 @@ class Run:
 
     def plot(self, path: str | Path | None = None, reference: list | None = None) -> Any:
         """The report figure; saved to `path` if given."""
-        from obsnet.plots import report
+        from obsnet.plots.report import report
 
         return report(self, path, reference=reference)
+
+    def drawing(self, path: str | Path, reference: list | None = None) -> Generator[None, Any, None]:
+        """The report in two steps, as `obsnet.beside` takes them; the second is sent segments, tracks and info."""
+        from obsnet.plots.report import drawing
+
+        yield from drawing(self, path, reference)
 
 
 def detect(
@@ -126,7 +132,8 @@ def track(
     starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
     amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
     folder : write maps and features there block by block, so that memory stays flat with record length.
-    progress : called with seconds done and in all. threads : for the compiled loops.
+    progress : called with seconds done and in all. threads : for the detectors and the search.
+    heard : called with the run when all is heard, before tracks are looked for.
 
     Returns
     -------
@@ -155,6 +162,7 @@ def _run(
     folder: str | Path | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
+    heard: Callable[[Run], None] | None = None,
 ) -> Run:
     clock = Clock()
     threads = threads or os.cpu_count() or 1
@@ -172,6 +180,8 @@ def _run(
         _require_minutes(sink.detections(), source, config)
         maps, features = sink.close()
     run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
+    if heard is not None:
+        heard(run)
     if tracking and len(run.presence):
         run.live = pipeline.followed() if config.tracker == "focalization" else run.live
         run.segments, run.tracks = find_tracks(run, threads)

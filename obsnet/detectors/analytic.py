@@ -31,6 +31,9 @@ EXPONENT_LIMIT = 690.0
 MOST_CELLS = 2e6
 """Cells of range and closing range rate that a minute may have; the default has 2e4."""
 
+_WINDOWS, _RANGES = 2, 64
+"""Windows stacked, and ranges matched, at once: what fits a core's cache, and what pulses have in common."""
+
 UNHEARD = 1e-3
 """Cepstral amplitude, a tenth of the noise of a 1024-sample frame, below which a pair counts as silent."""
 
@@ -181,11 +184,12 @@ class AnalyticAzimuthDetector:
         if config.mode == "tonal":
             llr = self._tonal(real, imag, null, times, minutes, angle)
         else:
-            llr = np.zeros((len(minutes), len(angle)))
-            kernels.impulsive(
-                real, imag, null, start, stop, np.cos(angle), np.sin(angle), config.mean_resultant_length,
-                config.frequency_overlap_exponent, config.detection_probability, llr,
+            said = kernels.impulsive(
+                real, imag, null, angle, config.mean_resultant_length, config.frequency_overlap_exponent,
+                config.detection_probability,
             )  # fmt: skip
+            before = np.concatenate([np.zeros((1, len(angle))), np.cumsum(said, axis=0)])
+            llr = before[stop] - before[start]
         covered = coverage(~np.isnan(real).all(axis=0), start, stop, minutes, config.window_s, hop_s)
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, config.azimuth, 360 // fold)
@@ -204,17 +208,14 @@ class AnalyticAzimuthDetector:
         block_edges = minutes[0] - config.window_s / 2 + config.step_s * np.arange(len(minutes) + per_window)
         edges = np.searchsorted(times, block_edges - 1e-6)
         parts = np.array_split(np.arange(real.shape[0]), min(self._threads, real.shape[0]))
-        totals = [np.zeros((len(minutes), len(angle))) for _ in parts]
 
-        def one(part: np.ndarray, total: np.ndarray) -> None:
+        def one(part: np.ndarray) -> np.ndarray:
             band = slice(part[0], part[-1] + 1)
-            kernels.tonal(
-                real[band], imag[band], null[band], edges, per_window, np.cos(angle), np.sin(angle),
-                config.mean_resultant_length, total,
-            )  # fmt: skip
+            return kernels.tonal(
+                real[band], imag[band], null[band], edges, per_window, angle, config.mean_resultant_length
+            )
 
-        _in_threads(one, list(zip(parts, totals, strict=True)), self._threads)
-        return np.log(sum(totals) / real.shape[0])
+        return np.log(sum(_in_threads(one, [(part,) for part in parts], self._threads)) / real.shape[0])
 
 
 class AnalyticRangeDetector:
@@ -234,8 +235,7 @@ class AnalyticRangeDetector:
         self._propagation = propagation
         self._amplitudes = amplitudes
         self._threads = threads or os.cpu_count() or 1
-        self._model: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        self._quefrency = np.empty(0)
+        self._bank: _MatchedFilters | None = None
 
     def maps(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
         """Log-likelihood ratio against range and range rate, and its coverage, at `minutes`.
@@ -254,82 +254,120 @@ class AnalyticRangeDetector:
         times = to_posix(cepstrogram["time"].values)
         frames = cepstrogram.values.T
         valid = ~np.isnan(frames[:, 0])
-        scores, active, pad = self._scores(cepstrogram, np.where(valid[:, None], frames, 0.0), valid)
+        bank = self._filters(cepstrogram)
+        scores = bank.scores(np.where(valid[:, None], frames, 0.0), valid)
         start, stop = window_bounds(times, minutes, config.window_s)
-        llr = np.zeros((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
+        llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
 
         def one(lo: int, hi: int) -> None:
-            window = (start[lo:hi], stop[lo:hi], times, minutes[lo:hi])
-            llr[lo:hi] = self._stack(scores, active, pad, *window).transpose(0, 2, 1)
+            beam = kernels.slant_stack(
+                scores, bank.margin, start[lo:hi], stop[lo:hi], times, minutes[lo:hi], config.range_step_m, config.range_rate
+            )  # fmt: skip
+            llr[lo:hi] = bank.wandering(beam).transpose(0, 2, 1)
 
-        bounds = np.unique(np.append(np.arange(0, len(minutes), 8), len(minutes)))
+        bounds = np.unique(np.append(np.arange(0, len(minutes), _WINDOWS), len(minutes)))
         _in_threads(one, list(itertools.pairwise(bounds)), self._threads)
         covered = coverage(valid, start, stop, minutes, config.window_s, hop(times))
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 
-    def _stack(
-        self,
-        scores: np.ndarray,
-        active: np.ndarray,
-        pad: int,
-        start: np.ndarray,
-        stop: np.ndarray,
-        times: np.ndarray,
-        minutes: np.ndarray,
-    ) -> np.ndarray:
-        """Sum over the pairs of the log of the wandering mean of exp(slant stack); (window, range rate, range) float32."""
-        config = self.config
-        n_range = len(config.range_m)
-        kernel = _gaussian(config.wander_bins)
-        radius = len(kernel) // 2
-        total = np.zeros((len(minutes), len(config.range_rate), n_range), np.float32)
-        for pair, (first, last) in zip(scores, active, strict=True):
-            lo, hi = max(first - radius - pad, 0), min(last + radius + pad, n_range)
-            if hi <= lo:
-                continue
-            raised = np.zeros((len(minutes), len(config.range_rate), hi - lo + 2 * radius))
-            inner = slice(max(radius - lo, 0), hi - lo + 2 * radius - max(hi + radius - n_range, 0))
-            begin = lo - radius + inner.start
-            beam = np.empty((*raised.shape[:2], inner.stop - inner.start))
-            kernels.slant_stack(
-                pair, pad, begin, start, stop, times, minutes, config.range_step_m, config.range_rate, beam
-            )
-            np.exp(beam, out=raised[:, :, inner])
-            on_grid = np.zeros(raised.shape[2])
-            on_grid[inner] = 1.0
-            smooth = np.empty((*raised.shape[:2], hi - lo))
-            kernels.wander(raised, kernel, np.convolve(on_grid, kernel, "valid"), smooth)
-            total[:, :, lo:hi] += np.log(smooth, out=smooth)
-        return total
-
-    def _scores(
-        self, cepstrogram: xr.DataArray, frames: np.ndarray, valid: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Per-frame log-likelihood ratio of every pair and range: a matrix product with the matched pulses."""
-        config = self.config
+    def _filters(self, cepstrogram: xr.DataArray) -> _MatchedFilters:
         quefrency = cepstrogram["quefrency"].values
-        if self._model is None or not np.array_equal(quefrency, self._quefrency):
+        if self._bank is None or not np.array_equal(quefrency, self._bank.quefrency):
             nfft = int(cepstrogram.attrs.get("nfft", 2 * (len(quefrency) - 1)))
-            pulses = cepstral_model(quefrency, self._propagation, self._amplitudes, config)
-            weight = pulses / noise_std(quefrency, nfft) ** 2
-            energy = 0.5 * np.einsum("prq,prq->pr", weight, pulses)
-            heard = np.abs(pulses).max(axis=2) > 0
-            active = np.array(
-                [[row.argmax(), len(row) - row[::-1].argmax()] if row.any() else [0, 0] for row in heard]
-            )
-            self._model = (weight.astype(np.float32), energy.astype(np.float32), active.astype(np.int64))
-            self._quefrency = quefrency
-        weight, energy, active = self._model
-        pad = int(np.ceil(config.max_range_rate_mps * config.window_s / 2 / config.range_step_m)) + 2
-        n_pairs, n_range, _ = weight.shape
-        scores = np.zeros((n_pairs, len(frames), n_range + 2 * pad), np.float32)
-        for p in range(n_pairs):
-            inside = scores[p, :, pad:-pad]
-            np.matmul(frames, weight[p].T, out=inside)
-            inside -= energy[p]
-            inside[~valid] = 0.0
-        return scores, active, pad
+            pulses = cepstral_model(quefrency, self._propagation, self._amplitudes, self.config)
+            self._bank = _MatchedFilters(quefrency, nfft, pulses, self.config)
+        return self._bank
+
+
+class _MatchedFilters:
+    """Log-likelihood ratio of every pair and range in a frame, where a pair may be heard, and the mean over its wandering.
+
+    The ranges at which a pair is heard, and what a slant stack and the wandering reach beyond them, lie side by side,
+    pair after pair, as the columns of one array.
+
+    Parameters
+    ----------
+    quefrency : s. nfft : samples of the frames that the cepstra are of.
+    pulses : (n_pairs, n_range, n_quefrency) of `cepstral_model`.
+    """
+
+    def __init__(
+        self, quefrency: np.ndarray, nfft: int, pulses: np.ndarray, config: RangeDetectorConfig
+    ) -> None:
+        self.quefrency, self._config = quefrency, config
+        self._kernel = _gaussian(config.wander_bins)
+        self._radius = radius = len(self._kernel) // 2
+        self.margin = kernels.stack_margin(config.range_rate, config.window_s, config.range_step_m)
+        n_range = len(config.range_m)
+        precision = 1.0 / noise_std(quefrency, nfft) ** 2
+        self._tiles: list[tuple[slice, slice, np.ndarray, np.ndarray]] = []
+        self._heard: list[tuple[slice, slice]] = []
+        cells = []
+        column = self.margin
+        for pulse in pulses:
+            heard = np.flatnonzero(np.abs(pulse).max(axis=1) > 0)
+            if not heard.size:
+                continue
+            lo = max(int(heard[0]) - radius - self.margin, 0)
+            hi = min(int(heard[-1]) + 1 + radius + self.margin, n_range)
+            for first in range(int(heard[0]), int(heard[-1]) + 1, _RANGES):
+                part = slice(first, min(first + _RANGES, int(heard[-1]) + 1))
+                lags = np.flatnonzero(np.abs(pulse[part]).max(axis=0) > 0)
+                if lags.size:
+                    self._add_tile(
+                        pulse, part, slice(int(lags[0]), int(lags[-1]) + 1), precision, column + radius - lo
+                    )
+            self._heard.append((slice(lo, hi), slice(column - self.margin, column - self.margin + hi - lo)))
+            cells.append(np.arange(lo - radius, hi + radius + self.margin))
+            cells[-1][hi - lo + 2 * radius :] = -1
+            column += len(cells[-1])
+        self._columns = column
+        cell = np.concatenate(cells)[: column - 2 * self.margin] if cells else np.empty(0, int)
+        on_grid = (cell >= 0) & (cell < n_range)
+        self._off_grid = np.flatnonzero(~on_grid)
+        share = np.convolve(on_grid, self._kernel, "valid")
+        self._cut = np.flatnonzero(np.abs(share - 1.0) > 1e-12)
+        self._share = np.where(share > 0, share, 1.0)[self._cut]
+
+    def _add_tile(
+        self, pulse: np.ndarray, part: slice, lags: slice, precision: np.ndarray, offset: int
+    ) -> None:
+        weight = pulse[part, lags] * precision[lags]
+        energy = 0.5 * np.sum(weight * pulse[part, lags], axis=1)
+        columns = slice(part.start + offset, part.stop + offset)
+        self._tiles.append(
+            (columns, lags, np.ascontiguousarray(weight.T, np.float32), energy.astype(np.float32))
+        )
+
+    def scores(self, frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Log-likelihood ratios (n_frames, n_columns) float32 of cepstra (n_frames, n_quefrency); 0 where not `valid`."""
+        made = np.zeros((len(frames), self._columns), np.float32)
+        for columns, lags, weight, energy in self._tiles:
+            np.matmul(frames[:, lags], weight, out=made[:, columns])
+            made[:, columns] -= energy
+        made[~valid] = 0.0
+        return made
+
+    def wandering(self, beam: np.ndarray) -> np.ndarray:
+        """Sum over the pairs of the log of the wandering mean of exp(beam): (window, range rate, range) float32.
+
+        Parameters
+        ----------
+        beam : (n_windows, n_rates, n) float32 of `kernels.slant_stack`; overwritten.
+        """
+        total = np.zeros((*beam.shape[:2], len(self._config.range_m)), np.float32)
+        np.clip(beam, -kernels.LARGEST_LOG, kernels.LARGEST_LOG, out=beam)
+        raised = np.exp(beam, dtype=float)
+        raised[..., self._off_grid] = 0.0
+        mean = kernels.wander(raised.reshape(-1, raised.shape[2]), self._kernel).reshape(*beam.shape[:2], -1)
+        mean[..., self._cut] /= self._share
+        logs = np.empty(mean.shape, np.float32)
+        with np.errstate(divide="ignore"):
+            np.log(mean, out=logs, casting="same_kind")
+        for ranges, columns in self._heard:
+            total[:, :, ranges] += logs[:, :, columns]
+        return total
 
 
 def cepstral_model(
@@ -445,14 +483,11 @@ def _gaussian(std_bins: float) -> np.ndarray:
     return weights / weights.sum()
 
 
-def _in_threads(task: Callable, arguments: list[tuple], threads: int) -> None:
+def _in_threads(task: Callable, arguments: list[tuple], threads: int) -> list:
     if threads == 1:
-        for argument in arguments:
-            task(*argument)
-        return
+        return [task(*argument) for argument in arguments]
     with ThreadPoolExecutor(threads) as pool:
-        for future in [pool.submit(task, *argument) for argument in arguments]:
-            future.result()
+        return [future.result() for future in [pool.submit(task, *argument) for argument in arguments]]
 
 
 def _check_product(config: AzimuthDetectorConfig, hop_s: float) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import uniform_filter1d
 
 from obsnet.detectors.background import BackgroundDirection
 from obsnet.errors import LayoutError, ModelError
@@ -343,6 +342,8 @@ class _Base:
 
 def _invariants(base: _Base, low: int, high: int, ambiguity_deg: int) -> Cells:
     """Cells low … high − 1 of the base."""
+    from scipy.ndimage import uniform_filter1d
+
     start, stop = max(low - PAST, 0), min(high + AHEAD, len(base.index))
     flow, level, valid = (values[start:stop] for values in (base.flow, base.level, base.valid))
     inner = slice(low - start, high - start)

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import uniform_filter1d
 
 from obsnet.layout import to_posix
 
@@ -71,9 +70,8 @@ class BackgroundDirection:
         if count == 0:
             return total
         mean = total / count
-        return uniform_filter1d(mean.real, smooth_bins, mode="nearest") + 1j * uniform_filter1d(
-            mean.imag, smooth_bins, mode="nearest"
-        )
+        held = np.pad(mean, (smooth_bins // 2, (smooth_bins - 1) // 2), mode="edge")
+        return np.convolve(held, np.full(smooth_bins, 1.0 / smooth_bins), "valid")
 
     def _remember(self, step: int, values: np.ndarray) -> None:
         valid = ~np.isnan(values).all(axis=0)

@@ -21,6 +21,9 @@ from obsnet.layout import to_posix
 
 LikelihoodMaps: TypeAlias = xr.Dataset
 
+_MINUTES = 4
+"""Minutes of range maps at a time: what fits a core's cache."""
+
 
 class Detector(Protocol):
     """Anything that turns a stretch of representations into likelihood maps."""
@@ -105,11 +108,16 @@ def range_presence(
     the same over half of the range rates (eq. 25).
     """
     prior = (np.maximum(range_m, 0.0) / np.maximum(range_m, 0.0).sum()).astype(np.float32)
-    top = np.max(range_llr, axis=(1, 2))
-    top = np.where(np.isfinite(top), top, np.float32(0.0))
-    raised = range_llr - top[:, None, None]
-    np.exp(raised, out=raised)
-    per_rate = np.matmul(prior, raised)
+    top = np.empty(len(range_llr), np.float32)
+    per_rate = np.empty((len(range_llr), len(range_rate)), np.float32)
+    for first in range(0, len(range_llr), _MINUTES):
+        part = slice(first, first + _MINUTES)
+        best = np.max(range_llr[part], axis=(1, 2))
+        # Lifted, so that no term or product falls where float32 holds it only denormally, which takes ten times as long.
+        top[part] = np.where(np.isfinite(best), best, np.float32(0.0)) - np.float32(40.0)
+        raised = range_llr[part] - top[part, None, None]
+        np.exp(np.maximum(raised, np.float32(-45.0), out=raised), out=raised)
+        np.matmul(prior, raised, out=per_rate[part])
     with np.errstate(divide="ignore"):
         return {
             name: np.log(per_rate[:, chosen].mean(axis=1)) + top

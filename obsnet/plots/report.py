@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +17,7 @@ from obsnet.plots import overlay, panels, style
 from obsnet.plots.columns import Columns
 from obsnet.plots.plan import close_up, plan_view
 from obsnet.run import Run
+from obsnet.trackers.track import Segment, Track
 
 if TYPE_CHECKING:
     from obsnet.ais import ReferenceTrack
@@ -23,6 +25,13 @@ if TYPE_CHECKING:
 _COLUMNS = 740
 _PAGE = (13.6, 9.4)
 _LEFT, _WIDTH = 0.75, 7.2
+_ROWS = (
+    ("spectrogram", panels.spectrogram, 1.3),
+    ("azigram", panels.azigram, 1.3),
+    ("cepstrogram", panels.cepstrogram, 1.5),
+    ("azimuth likelihood", panels.azimuth_map, 1.95),
+    ("range likelihood", panels.range_map, 1.95),
+)
 _CLOSE_UPS, _SHORT = 3, 11
 """Close-ups of so many tracks, where the text has fewer lines than that."""
 
@@ -47,41 +56,67 @@ def report(run: Run, path: str | Path | None = None, reference: list[ReferenceTr
     OutputError
         The file cannot be written.
     """
-    made = style.figure(*_PAGE)
-    columns = Columns.over(run.maps["time"].values, _COLUMNS)
-    if columns is None:
-        title = f"{run.station.code}: no minute of data"
-        style.say(style.box(made, _LEFT, 0.6, _PAGE[0] - 2 * _LEFT, _PAGE[1] - 1.4), "no minute of data")
-    else:
-        title = f"{run.station.code}, {style.span(columns.start, columns.end)}: {_found(run)}"
-        _fill(made, run, reference or [], columns)
-    style.title(made, title)
+    page = Page(run)
+    page.fill(run, reference or [])
     if path is not None:
-        style.save(made, path)
-    return made
+        style.save(page.figure, path)
+    return page.figure
 
 
-def _fill(made: Figure, run: Run, reference: list[ReferenceTrack], columns: Columns) -> None:
-    start, end = columns.start, columns.end
-    reference = [ship for ship in reference if ship.endtime > start and ship.starttime < end]
-    rows = (
-        ("spectrogram", panels.spectrogram, 1.3),
-        ("azigram", panels.azigram, 1.3),
-        ("cepstrogram", panels.cepstrogram, 1.5),
-        ("azimuth likelihood", panels.azimuth_map, 1.95),
-        ("range likelihood", panels.range_map, 1.95),
-    )
-    top = _PAGE[1] - 0.45
-    for name, draw, height in rows:
-        ax = style.box(made, _LEFT, top - height, _WIDTH, height)
-        top -= height + 0.1
-        draw(ax, run, columns)
-        if draw in (panels.azimuth_map, panels.range_map):
-            kind: overlay.Kind = "azimuth" if draw is panels.azimuth_map else "range"
-            overlay.curves(ax, run, reference, kind, start, end)
-            overlay.detections(ax, run, kind, start, end)
-        style.time_axis(ax, start, end, labelled=draw is panels.range_map)
-        style.name(ax, name)
+def drawing(
+    run: Run, path: str | Path, reference: list[ReferenceTrack] | None = None
+) -> Generator[None, tuple[list[Segment], list[Track], dict[str, Any]], None]:
+    """The report in two steps: what was heard at once, and when the run's segments, tracks and info are sent, the rest."""
+    page = Page(run)
+    run.segments, run.tracks, run.info = yield
+    page.fill(run, reference or [])
+    style.save(page.figure, path)
+
+
+class Page:
+    """The report as it grows: first what was heard, then what was found in it.
+
+    Attributes
+    ----------
+    figure : matplotlib Figure.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self.figure = style.figure(*_PAGE)
+        self._columns = Columns.over(run.maps["time"].values, _COLUMNS)
+        self._panels: list[Axes] = []
+        if self._columns is None:
+            place = style.box(self.figure, _LEFT, 0.6, _PAGE[0] - 2 * _LEFT, _PAGE[1] - 1.4)
+            style.say(place, "no minute of data")
+            return
+        top = _PAGE[1] - 0.45
+        for name, draw, height in _ROWS:
+            ax = style.box(self.figure, _LEFT, top - height, _WIDTH, height)
+            top -= height + 0.1
+            draw(ax, run, self._columns)
+            style.name(ax, name)
+            self._panels.append(ax)
+
+    def fill(self, run: Run, reference: list[ReferenceTrack]) -> None:
+        """Draw what was found, and AIS, over the panels and on a plan; say it in words."""
+        if self._columns is None:
+            style.title(self.figure, f"{run.station.code}: no minute of data")
+            return
+        start, end = self._columns.start, self._columns.end
+        reference = [ship for ship in reference if ship.endtime > start and ship.starttime < end]
+        for ax, (_, draw, _) in zip(self._panels, _ROWS, strict=True):
+            if draw in (panels.azimuth_map, panels.range_map):
+                kind: overlay.Kind = "azimuth" if draw is panels.azimuth_map else "range"
+                overlay.curves(ax, run, reference, kind, start, end)
+                overlay.detections(ax, run, kind, start, end)
+            style.time_axis(ax, start, end, labelled=draw is panels.range_map)
+        _plan_and_words(self.figure, run, reference, start, end)
+        style.title(self.figure, f"{run.station.code}, {style.span(start, end)}: {_found(run)}")
+
+
+def _plan_and_words(
+    made: Figure, run: Run, reference: list[ReferenceTrack], start: float, end: float
+) -> None:
     plan_view(style.box(made, 9.25, 4.8, 4.15, 4.15), run, reference, start, end)
     words = style.box(made, 9.0, 2.0, 4.5, 2.25)
     words.set_axis_off()

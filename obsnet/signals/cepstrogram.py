@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 import scipy.fft
-import scipy.linalg
 import xarray as xr
 
 from obsnet.errors import ConfigError, LayoutError
@@ -245,14 +244,14 @@ def leading_basis(gram: np.ndarray, count: int, guess: int = 32) -> np.ndarray:
 def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalues, decreasing, and their vectors, by subspace iteration from a fixed start."""
     if 2 * size >= len(matrix):
-        values, vectors = scipy.linalg.eigh(matrix, check_finite=False)
+        values, vectors = np.linalg.eigh(matrix)
         return values[::-1][:size], vectors[:, ::-1][:, :size]
     single = matrix.astype(np.float32)
     basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8), np.float32)
     for _ in range(5):
         basis, _ = np.linalg.qr(single @ (single @ basis))
     basis = basis.astype(matrix.dtype)
-    values, turn = scipy.linalg.eigh(basis.T @ matrix @ basis, check_finite=False)
+    values, turn = np.linalg.eigh(basis.T @ matrix @ basis)
     return values[::-1][:size], (basis @ turn)[:, ::-1][:, :size]
 
 

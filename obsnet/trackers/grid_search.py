@@ -8,9 +8,7 @@ Around the best one the course may bend (`bends`).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,15 +17,14 @@ import xarray as xr
 
 from obsnet.errors import ConfigError
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
-from obsnet.trackers import search_kernels
 from obsnet.trackers.bends import MARGIN_S, bends
+from obsnet.trackers.course_grid import CourseGrid, Delay, best_first, score_points
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import (
     ScoreMaps,
     above_floor,
     azimuth_scores,
     lobe,
-    polyphase,
     range_scores,
     tiles,
 )
@@ -141,8 +138,9 @@ def search(
     tracks: list[Track] = []
     # Without azimuths nothing tells a second ship from the first one's ghost ranges.
     for number in range(config.max_ships if "azimuth_llr" in maps else 1):
-        found = finder.find(azimuth_llr, range_llr, jointly=bool(number or known) and "azimuth_llr" in maps)
         least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
+        jointly = bool(number or known) and "azimuth_llr" in maps
+        found = finder.find(azimuth_llr, range_llr, least, jointly)
         if found is None or found.log_bayes_factor < least:
             break
         if finder.believable(found) and (found.extra["heard"] >= 0.5 or not (tracks or known)):
@@ -170,26 +168,31 @@ class _Finder:
         self.rate = maps["range_rate"].values if "range_llr" in maps else np.array([-1.0, 0.0, 1.0])
         self.sees_course = "azimuth_llr" in maps
         self.sees_range = "range_llr" in maps
-        self.delay_step = 250.0
-        self.delay = np.asarray(delay(np.arange(0.0, 150_001.0, self.delay_step)), float)
+        self._runs = float(np.log(len(times) * (len(times) + 1) / 2))
+        self.delay = Delay(np.asarray(delay(np.arange(0.0, 150_001.0, 250.0)), float), 250.0)
 
     def find(
-        self, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None, jointly: bool = False
+        self,
+        azimuth_llr: np.ndarray | None,
+        range_llr: np.ndarray | None,
+        least: float,
+        jointly: bool = False,
     ) -> Track | None:
-        """The best track of the tiles, or none if no hypothesis scores above 0.
+        """The best track of the tiles, or none if none can have a log Bayes factor of `least`.
 
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
         coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
         fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
-        best: tuple[float, np.ndarray] | None = None
+        best, point = 0.0, None
         for start in self._coarse(coarse):
-            value, point = self._level(start, MEDIUM, fine)
-            if best is None or value > best[0]:
-                best = (value, point)
-        if best is None or best[0] <= 0.0:
+            best, point = self._level(start, MEDIUM, fine, best, point)
+        if point is None:
             return None
-        value, point = self._level(best[1], FINE, fine)
+        best, point = self._level(point, FINE, fine)
+        # The evidence is less than the greatest likelihood, by far more than what a finer grid would find.
+        if point is None or self.config.exponent * best - self._runs < least:
+            return None
         return self._track(point, fine)
 
     def _coarse(self, scores: ScoreMaps) -> list[np.ndarray]:
@@ -204,85 +207,50 @@ class _Finder:
             cpa_range = cpa_range[cpa_range >= 0]
         speed = np.arange(config.min_speed_mps, config.max_speed_mps + 1e-9, 0.5)
         course = np.arange(0.0, 360.0, 10.0) if self.sees_course else np.zeros(1)
-        values = self._grid(cpa_time, cpa_range, speed, course, scores)
-        plane = values.max(axis=(0, 3))
-        found = []
-        for _ in range(config.candidates):
-            i, j = np.unravel_index(plane.argmax(), plane.shape)
-            if plane[i, j] <= 0:
+        grid = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
+        bounds = grid.bounds(self.threads)
+        values, headings = np.full(bounds.shape, -np.inf, np.float32), np.zeros(bounds.shape, int)
+        found: list[tuple[int, int, int]] = []
+        for cells in best_first(bounds):
+            least = values[found[-1]] if len(found) == config.candidates else 0.0
+            cells = cells[bounds.flat[cells] > least]
+            if not cells.size:
                 break
-            t, q = np.unravel_index(values[:, i, j].argmax(), (len(cpa_time), len(course)))
-            found.append(np.array([cpa_time[t], cpa_range[i], course[q], speed[j]]))
-            plane[np.ix_(_near(i, 3, len(cpa_range)), _near(j, 2, len(speed)))] = -1.0
-        return found
+            said = grid.scores(cells)
+            values.flat[cells], headings.flat[cells] = said.max(axis=1), said.argmax(axis=1)
+            found = _apart(values, config.candidates)
+        return [
+            np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]) for t, i, j in found
+        ]
 
-    def _level(self, centre: np.ndarray, level: _Level, scores: ScoreMaps) -> tuple[float, np.ndarray]:
-        """Best score and hypothesis of a grid around `centre`."""
+    def _level(
+        self,
+        centre: np.ndarray,
+        level: _Level,
+        scores: ScoreMaps,
+        best: float = -np.inf,
+        point: np.ndarray | None = None,
+    ) -> tuple[float, np.ndarray | None]:
+        """Best score and hypothesis of a grid around `centre`, or `best` and `point` where none is better."""
         axes = [
             c + np.arange(-h, h + s / 2, s) for c, h, s in zip(centre, level.half, level.step, strict=True)
         ]
         cpa_time, cpa_range, course, speed = axes
         speed = speed[(speed >= self.config.min_speed_mps) & (speed <= self.config.max_speed_mps)]
         course = course if self.sees_course else centre[2:3]
-        values = self._grid(cpa_time, cpa_range, speed, course, scores)
-        t, i, j, q = np.unravel_index(values.argmax(), values.shape)
-        return float(values[t, i, j, q]), np.array([cpa_time[t], cpa_range[i], course[q] % 360.0, speed[j]])
-
-    def _grid(
-        self,
-        cpa_time: np.ndarray,
-        cpa_range: np.ndarray,
-        speed: np.ndarray,
-        course: np.ndarray,
-        scores: ScoreMaps,
-    ) -> np.ndarray:
-        """Score of every hypothesis of a grid, (n_cpa_time, n_cpa_range, n_speed, n_course) float32."""
-        offset, index = np.unique(np.round(self.tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
-        index = index.reshape(len(cpa_time), len(self.tiles))
-        shape = (len(cpa_range), len(speed), len(offset))
-        across, along = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        row = np.empty(shape, np.int32)
-        out = np.empty((len(cpa_time), len(cpa_range), len(speed), len(course)), np.float32)
-        course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
-        rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
-        phases, length = rows.shape[1:]
-        flat = rows.reshape(len(rows), -1)
-
-        def table(part: slice) -> None:
-            search_kernels.tabulate(
-                offset, cpa_range[part], speed, self.delay, self.delay_step, scores.geometry, step, course[0], phases, length,
-                across[part], along[part], row[part],
-            )  # fmt: skip
-
-        def total(part: slice) -> None:
-            search_kernels.sum_scores(
-                index[part], across, along, row, scores.range_score, flat, scores.jointly, out[part]
-            )
-
-        self._share(table, len(cpa_range))
-        self._share(total, len(cpa_time))
-        return out
-
-    def _share(self, task: Callable, count: int) -> None:
-        bounds = np.linspace(0, count, self.threads + 1).astype(int)
-        parts = [slice(lo, hi) for lo, hi in itertools.pairwise(bounds)]
-        if self.threads == 1:
-            task(parts[0])
-            return
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(task, parts))
-
-    def _score_points(
-        self, points: np.ndarray, scores: ScoreMaps, keep_tiles: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Score of each hypothesis, and each tile's share of it where asked for."""
-        out = np.empty(len(points))
-        per_tile = np.zeros((len(self.tiles), len(points) if keep_tiles else 0))
-        search_kernels.score_points(
-            np.ascontiguousarray(points), self.tiles, self.delay, self.delay_step, scores.range_score, scores.geometry,
-            scores.azimuth_score, scores.azimuth_step, scores.jointly, per_tile, out,
-        )  # fmt: skip
-        return out, per_tile
+        grid = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
+        bounds = grid.bounds(self.threads)
+        for cells in best_first(bounds):
+            cells = cells[bounds.flat[cells] > best]
+            if not cells.size:
+                break
+            said = grid.scores(cells)
+            cell, q = np.unravel_index(said.argmax(), said.shape)
+            if said[cell, q] > best:
+                best = float(said[cell, q])
+                t, i, j = np.unravel_index(cells[cell], bounds.shape)
+                point = np.array([cpa_time[t], cpa_range[i], course[q] % 360.0, speed[j]])
+        return best, point
 
     def _track(self, best: np.ndarray, scores: ScoreMaps) -> Track:
         """The posterior around the best hypothesis, as a track."""
@@ -290,19 +258,18 @@ class _Finder:
         seen = np.array([True, True, self.sees_course, True])
 
         def log_likelihood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            total, per_tile = self._score_points(points, scores, keep_tiles=True)
+            total, per_tile = score_points(points, self.tiles, self.delay, scores)
             return config.exponent * total, config.exponent * per_tile
 
         known = posterior(best, log_likelihood, self._inside, seen, samples=config.samples, seed=config.seed)
         mean, cov = known.mean, known.covariance
-        score, per_tile = self._score_points(best[None], scores, keep_tiles=True)
+        score, per_tile = score_points(best[None], self.tiles, self.delay, scores)
         lo, hi = _best_run(per_tile[:, 0])
         fixed = self._fixed_source(scores, lo, hi)
-        n = len(self.tiles)
         span = self.tiles[-1] + 3600.0
         volume = span * 2 * config.max_cpa_range_m * (config.max_speed_mps - config.min_speed_mps)
         volume *= 360.0 if self.sees_course else 0.5
-        log_bayes_factor = float(known.log_evidence - np.log(volume) - np.log(n * (n + 1) / 2))
+        log_bayes_factor = float(known.log_evidence - np.log(volume) - self._runs)
         if not self.sees_course:
             cov[2, :] = cov[:, 2] = 0.0
             cov[2, 2] = np.inf
@@ -329,11 +296,7 @@ class _Finder:
         reach = np.maximum(heard, 0.0) + MARGIN_S
 
         def log_likelihood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            total, per_tile = np.empty(len(points)), np.zeros((len(self.tiles), len(points)))
-            search_kernels.score_bent_points(
-                np.ascontiguousarray(points), reach, self.tiles, self.delay, self.delay_step, scores.range_score, scores.geometry,
-                scores.azimuth_score, scores.azimuth_step, scores.jointly, per_tile, total,
-            )  # fmt: skip
+            total, per_tile = score_points(points, self.tiles, self.delay, scores, reach)
             return self.config.exponent * total, self.config.exponent * per_tile
 
         config = self.config
@@ -440,11 +403,7 @@ class _Finder:
         emitted = self.origin + self.tiles
         for _ in range(3):
             _, distance, _ = track.motion.observables(emitted)
-            emitted = (
-                self.origin
-                + self.tiles
-                - np.interp(distance, self.delay_step * np.arange(len(self.delay)), self.delay)
-            )
+            emitted = self.origin + self.tiles - self.delay(distance)
         azimuth, distance, rate = track.motion.observables(emitted)
         ranged = np.zeros(len(self.tiles), bool)
         if range_llr is not None:
@@ -463,6 +422,19 @@ class _Finder:
                 np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr), explained
             )
         return azimuth_llr, range_llr
+
+
+def _apart(values: np.ndarray, most: int) -> list[tuple[int, int, int]]:
+    """Places of the greatest positive values (cpa_time, cpa_range, speed), apart in CPA range and speed, best first."""
+    plane = values.max(axis=0)
+    found = []
+    for _ in range(most):
+        i, j = np.unravel_index(plane.argmax(), plane.shape)
+        if plane[i, j] <= 0:
+            break
+        found.append((int(values[:, i, j].argmax()), int(i), int(j)))
+        plane[np.ix_(_near(i, 3, plane.shape[0]), _near(j, 2, plane.shape[1]))] = -1.0
+    return found
 
 
 def _near(index: Any, reach: int, count: int) -> np.ndarray:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d
 
 from obsnet import netcdf
 from obsnet.layout import to_posix
 from obsnet.trackers.track import Segment
+
+_SILENT = np.float32(-60.0)
+"""Log ratio to the best of a map that counts as nothing; what float32 holds only denormally makes sums ten times as slow."""
+
+_ROWS, _TILES = 64, 4
+"""Ranges smoothed by one matrix product, and tiles at a time: what fits a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +36,29 @@ class ScoreMaps:
     azimuth_score: np.ndarray
     azimuth_step: float
     jointly: bool
+
+    @cached_property
+    def flat(self) -> np.ndarray:
+        """Range scores flattened, (n_tiles, n_range · n_rate and a corner of zeros for what lies off the grid)."""
+        n_tiles, _, n_rate = self.range_score.shape
+        return np.pad(self.range_score.reshape(n_tiles, -1), ((0, 0), (0, n_rate + 2)))
+
+    @cached_property
+    def best_corner(self) -> np.ndarray:
+        """The greatest of the four grid points around each point of `flat`."""
+        n_rate = self.range_score.shape[2]
+        ahead = np.maximum(self.flat[:, :-1], self.flat[:, 1:])
+        return np.maximum(ahead[:, :-n_rate], ahead[:, n_rate:])
+
+    def corner(self, range_m: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Index into `flat` of the grid point below in range and rate, and how far right and up of it, in grid steps."""
+        _, n_range, n_rate = self.range_score.shape
+        x = (range_m - self.geometry[0]) / self.geometry[1]
+        y = (rate - self.geometry[2]) / self.geometry[3]
+        inside = (x >= 0) & (x < n_range - 1) & (y >= 0) & (y < n_rate - 1)
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+        a, b = x.astype(np.int64), y.astype(np.int64)
+        return np.where(inside, a * n_rate + b, n_range * n_rate), x - a, y - b
 
 
 def tiles(
@@ -51,20 +81,33 @@ def tiles(
 def azimuth_scores(llr: np.ndarray, std_bins: float, bound: float, probability: float) -> np.ndarray:
     """Log mixture (1 − Pd) + Pd·ratio of azimuth maps (n_tiles, n_azimuth), the ratio smoothed around the circle."""
     ratio, top = _bounded(llr, bound)
-    return _mixed(gaussian_filter1d(ratio, std_bins, axis=1, mode="wrap"), top, probability)
+    return _mixed(ratio @ _gaussian(ratio.shape[1], std_bins, 4.0, "wrap"), top, probability)
 
 
 def range_scores(
     llr: np.ndarray, pool: int, std_bins: tuple[float, float], bound: float, probability: float
 ) -> np.ndarray:
     """The same of range maps (n_tiles, n_range, n_rate), means of `pool` ranges smoothed in range and range rate."""
-    ratio, top = _bounded(llr, bound)
-    if pool > 1:
-        bins = ratio.shape[1] // pool
-        ratio = ratio[:, : bins * pool].reshape(len(ratio), bins, pool, -1).mean(axis=2)
-    for axis, std in enumerate(std_bins, 1):
-        ratio = gaussian_filter1d(ratio, std, axis=axis, mode="nearest", truncate=3.0)
-    return _mixed(ratio, top, probability)
+    across, along = (
+        _gaussian(n, std, 3.0, "clip")
+        for n, std in zip((llr.shape[1] // pool, llr.shape[2]), std_bins, strict=True)
+    )
+    bands = []
+    for first in range(0, len(across), _ROWS):
+        reach = np.flatnonzero(across[:, first : first + _ROWS].any(axis=1))
+        near = slice(int(reach[0]), int(reach[-1]) + 1)
+        bands.append((slice(first, first + _ROWS), near, across[near, first : first + _ROWS].T))
+    out = np.empty((len(llr), len(across), len(along)), np.float32)
+    for first in range(0, len(llr), _TILES):
+        part = slice(first, first + _TILES)
+        ratio, top = _bounded(llr[part], bound)
+        if pool > 1:
+            ratio = ratio[:, : len(across) * pool].reshape(len(ratio), len(across), pool, -1).mean(axis=2)
+        ratio = ratio @ along
+        for rows, near, weight in bands:
+            np.matmul(weight, ratio[:, near], out=out[part, rows])
+        out[part] = _mixed(out[part], top, probability)
+    return out
 
 
 def lobe(
@@ -127,10 +170,21 @@ def polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -
     return np.ascontiguousarray(laid, dtype=np.float32), step
 
 
+def _gaussian(count: int, std_bins: float, truncate: float, ends: Literal["wrap", "clip"]) -> np.ndarray:
+    """Matrix (count, count) float32 by which a row is smoothed: around the circle, or with its ends held beyond them."""
+    radius = int(truncate * std_bins + 0.5)
+    lag = np.arange(-radius, radius + 1)
+    weight = np.exp(-0.5 * (lag / std_bins) ** 2) if radius else np.ones(1)
+    source = np.take(np.arange(count), np.arange(count)[:, None] + lag, mode=ends)
+    matrix = np.zeros((count, count))
+    np.add.at(matrix, (source, np.arange(count)[:, None]), weight / weight.sum())
+    return matrix.astype(np.float32)
+
+
 def _bounded(llr: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
     """exp(llr − max) and the log at which the maximum counts, at most `bound`; tiles without data are 1 and NaN."""
     top = llr.max(axis=tuple(range(1, llr.ndim)), keepdims=True)
-    ratio = np.exp(llr - top)
+    ratio = np.exp(np.maximum(llr - top, _SILENT))
     return np.nan_to_num(ratio, nan=1.0), np.minimum(top, bound)
 
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
-from obsnet.trackers import search_kernels
 from obsnet.trackers.bends import WANDER, bends, wander
+from obsnet.trackers.course_grid import Delay, score_points
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.posterior import posterior
+from obsnet.trackers.score_maps import ScoreMaps
 from tests.trackers.test_grid_search import MINUTES, SEGMENT, T0, delay, maps_of
 
 TIME = 180.0 * np.arange(-30, 31)
@@ -128,7 +129,7 @@ def test_bent_course_without_bends_is_straight_and_its_rate_is_the_ranges_slope(
     assert time[distance.argmin()] == BENT.cpa_time
 
 
-def test_kernel_puts_the_ship_where_the_course_does():
+def test_scores_put_the_ship_where_the_course_does():
     """A map that is a known function of range, range rate and azimuth scores what the course's observables say."""
     tiles = 180.0 * np.arange(70)
     range_m, rate = 70.0 * np.arange(715), 0.5 * np.arange(-26, 27)
@@ -137,13 +138,12 @@ def test_kernel_puts_the_ship_where_the_course_does():
     point = np.concatenate([[7000.0, 9_000.0, 60.0, 8.0], *(
         [*across, *along] for across, along in zip(BENT.across, BENT.along, strict=True)
     )])  # fmt: skip
-    step = 250.0
-    table = delay(np.arange(0.0, 150_001.0, step))
-    out, per_tile = np.empty(1), np.zeros((len(tiles), 1))
-    search_kernels.score_bent_points(
-        point[None], np.array(BENT.reach_s), tiles, table, step, np.repeat(score[None], len(tiles), 0),
-        np.array([0.0, 70.0, -13.0, 0.5]), np.repeat(pointing[None], len(tiles), 0), 1.0, False, per_tile, out,
+    scores = ScoreMaps(
+        np.repeat(score[None], len(tiles), 0), np.array([0.0, 70.0, -13.0, 0.5]),
+        np.repeat(pointing[None], len(tiles), 0), 1.0, jointly=False,
     )  # fmt: skip
+    table = Delay(delay(np.arange(0.0, 150_001.0, 250.0)), 250.0)
+    out, per_tile = score_points(point[None], tiles, table, scores, np.array(BENT.reach_s))
     emitted = T0 + tiles
     for _ in range(30):
         emitted = T0 + tiles - delay(BENT.observables(emitted)[1])

@@ -1,0 +1,247 @@
+"""Straight courses and the score maps of a segment in, the courses' scores out: bounds for a whole grid, exact where asked.
+
+A course's score is the greatest sum of its tiles' shares over any run of consecutive tiles: the stretch over which it is
+heard; a ship need not be heard for the whole segment. A tile's share is what the maps say where the course puts the ship
+when the sound left it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from obsnet.kinematics import departure
+from obsnet.trackers.score_maps import ScoreMaps, polyphase
+
+_CELLS_AT_ONCE, _PLACES_AT_ONCE = 1 << 16, 1 << 14
+_FIRST_BATCH, _LARGEST_BATCH = 512, 8192
+_TILES_AT_ONCE = 8
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Travel time [s] of the sound every `step_m` of range from 0."""
+
+    seconds: np.ndarray
+    step_m: float
+
+    def __call__(self, range_m: np.ndarray) -> np.ndarray:
+        """Travel time at ranges, linear; the last beyond the table."""
+        position = np.minimum(range_m / self.step_m, len(self.seconds) - 1)
+        below = np.minimum(position.astype(np.int64), len(self.seconds) - 2)
+        low = self.seconds[below]
+        return low + (position - below) * (self.seconds[below + 1] - low)
+
+    def emitted(self, heard: np.ndarray, cpa_range: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """When what is heard `heard` s after CPA left the ship, s after CPA: solves e + τ(R(e)) = heard."""
+        emitted = heard
+        for _ in range(3):
+            emitted = heard - self(np.sqrt(cpa_range * cpa_range + (speed * emitted) ** 2))
+        return emitted
+
+
+class CourseGrid:
+    """Every combination of CPA times, CPA ranges, speeds and courses.
+
+    Parameters
+    ----------
+    cpa_time : (n) s on the clock of `tiles`. cpa_range : m, signed. speed : m/s. course : deg, in equal steps.
+    tiles : times of the tiles, s. scores : ScoreMaps at the tiles.
+
+    Notes
+    -----
+    A cell is one CPA time, CPA range and speed, in this order in memory; all courses of a cell read the range map at
+    one place, and the azimuth map at as many neighbouring ones.
+    """
+
+    def __init__(
+        self,
+        cpa_time: np.ndarray,
+        cpa_range: np.ndarray,
+        speed: np.ndarray,
+        course: np.ndarray,
+        tiles: np.ndarray,
+        delay: Delay,
+        scores: ScoreMaps,
+    ) -> None:
+        self.shape = (len(cpa_time), len(cpa_range), len(speed))
+        self._jointly = scores.jointly
+        offset, index = np.unique(np.round(tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
+        self._index = index.reshape(len(cpa_time), len(tiles))
+        course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
+        rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
+        self._pointing = sliding_window_view(rows.reshape(len(rows), -1), len(course), axis=1)
+        self._place(offset, cpa_range, speed, delay, scores, step, float(course[0]), rows.shape[1:])
+
+    def _place(
+        self,
+        offset: np.ndarray,
+        cpa_range: np.ndarray,
+        speed: np.ndarray,
+        delay: Delay,
+        scores: ScoreMaps,
+        azimuth_step: float,
+        course_start: float,
+        layout: tuple[int, int],
+    ) -> None:
+        """Where each (time heard after CPA, CPA range and speed) reads the score maps."""
+        across, pace = (axis.reshape(-1) for axis in np.meshgrid(cpa_range, speed, indexing="ij"))
+        shape = (len(offset), len(across))
+        self._cell, self._row = np.empty(shape, np.int64), np.empty(shape, np.int64)
+        self._right, self._up = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self._range_score, self._best_corner = scores.flat, scores.best_corner
+        self._rates = scores.range_score.shape[2]
+        bins = int(360.0 / azimuth_step + 0.5)
+        phases, length = layout
+        step = max(_PLACES_AT_ONCE // len(across), 1)
+        for part in (slice(first, first + step) for first in range(0, len(offset), step)):
+            path = pace * delay.emitted(offset[part, None], across, pace)
+            distance = np.sqrt(across * across + path * path)
+            self._cell[part], self._right[part], self._up[part] = scores.corner(
+                distance, pace * path / np.maximum(distance, 1.0)
+            )
+            azimuth = np.rad2deg(np.arctan2(across, path)) + course_start
+            c = np.floor(azimuth / azimuth_step + 0.5).astype(np.int64) % bins
+            self._row[part] = (c % phases) * length + c // phases
+
+    def bounds(self, threads: int = 1) -> np.ndarray:
+        """What no course of a cell exceeds, (n_cpa_time, n_cpa_range, n_speed) float32.
+
+        Every tile counts with the best of its courses and with the best corner of the range map.
+        """
+        pointing = np.ascontiguousarray(self._pointing.max(axis=2))
+        everywhere = bool((pointing == pointing[:, :1]).all())
+        share = self._best_corner
+        out = np.empty((self.shape[0], self._cell.shape[1]), np.float32)
+
+        def fill(lo: int, hi: int) -> None:
+            run, best = np.zeros((2, hi - lo, out.shape[1]), np.float32)
+            for m in range(len(share)):
+                offset = self._index[lo:hi, m]
+                ahead = pointing[m, :1] if everywhere else pointing[m].take(self._row[offset])
+                _lengthen(run, best, ahead, share[m].take(self._cell[offset]), self._jointly)
+            out[lo:hi] = best
+
+        step = min(max(_CELLS_AT_ONCE // out.shape[1], 1), -(-len(out) // threads))
+        with ThreadPoolExecutor(threads) as pool:
+            edges = [*range(0, len(out), step), len(out)]
+            list(pool.map(fill, edges[:-1], edges[1:]))
+        return out.reshape(self.shape)
+
+    def scores(self, cells: np.ndarray) -> np.ndarray:
+        """Scores of all courses of chosen cells (flat indices), (n, n_course) float32."""
+        time, where = np.divmod(cells, self._cell.shape[1])
+        run, best = np.zeros((2, len(cells), self._pointing.shape[2]), np.float32)
+        for m, score in enumerate(self._range_score):
+            at = self._index[time, m] * self._cell.shape[1] + where
+            share = _between(score, self._cell.take(at), self._rates, self._right.take(at), self._up.take(at))
+            _lengthen(run, best, self._pointing[m][self._row.take(at)], share[:, None], self._jointly)
+        return best
+
+
+def _lengthen(
+    run: np.ndarray, best: np.ndarray, pointing: np.ndarray, share: np.ndarray, jointly: bool
+) -> None:
+    """Take the next tile into the best run that ends there, and that into the best of all; both in place.
+
+    Where `jointly`, range speaks for a course only in tiles where azimuth does too.
+    """
+    run += pointing
+    run += np.where(pointing > 0, share, np.minimum(share, 0.0)) if jointly else share
+    np.maximum(run, 0.0, out=run)
+    np.maximum(best, run, out=best)
+
+
+def _between(
+    score: np.ndarray, corner: np.ndarray, rates: int, right: np.ndarray, up: np.ndarray
+) -> np.ndarray:
+    """Bilinear interpolation of flattened range maps of so many `rates`, from a corner `right` in range and `up` in rate."""
+    low = score.take(corner) * (1 - up) + score.take(corner + 1) * up
+    high = score.take(corner + rates) * (1 - up) + score.take(corner + rates + 1) * up
+    return low * (1 - right) + high * right
+
+
+def best_first(bounds: np.ndarray) -> Iterator[np.ndarray]:
+    """Batches of a grid's cells (flat indices), the greatest bounds first."""
+    order = np.argsort(-bounds, axis=None)
+    first, size = 0, _FIRST_BATCH
+    while first < len(order):
+        yield order[first : first + size]
+        first, size = first + size, min(2 * size, _LARGEST_BATCH)
+
+
+def score_points(
+    points: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps, reach_s: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Score of each course of a list, both maps interpolated linearly.
+
+    Parameters
+    ----------
+    points : (n, 4) CPA time [s on the clock of `tiles`], signed CPA range [m], course [deg], speed [m/s]; of courses that
+        bend (n, 4 + 4·terms), for each term its bends across before and after CPA and along before and after.
+    reach_s : (2) s before and after CPA over which the velocity departs, of courses that bend (`kinematics.BentCourse`).
+
+    Returns
+    -------
+    scores (n), and each tile's share of them (n_tiles, n); float64.
+    """
+    cpa_time, _, course, _ = points[:, :4].T
+    per_tile = np.empty((len(tiles), len(points)))
+    bins, rates = scores.azimuth_score.shape[1], scores.range_score.shape[2]
+    azimuth_score, range_score = scores.azimuth_score.reshape(-1), scores.flat.reshape(-1)
+    for first in range(0, len(tiles), _TILES_AT_ONCE):
+        part = slice(first, first + _TILES_AT_ONCE)
+        tile = np.arange(len(tiles))[part, None]
+        side, ahead, rate = _heard(tiles[part, None] - cpa_time, points, delay, reach_s)
+        distance = np.sqrt(side * side + ahead * ahead)
+        corner, right, up = scores.corner(distance, rate / np.maximum(distance, 1.0))
+        share = _between(range_score, corner + tile * scores.flat.shape[1], rates, right, up)
+        turn = (course + np.rad2deg(np.arctan2(side, ahead))) % 360.0 / scores.azimuth_step
+        below = turn.astype(np.int64)
+        after = turn - below
+        pointing = azimuth_score.take(tile * bins + below % bins) * (1 - after)
+        pointing += azimuth_score.take(tile * bins + (below + 1) % bins) * after
+        if scores.jointly:
+            share = np.where(pointing > 0, share, np.minimum(share, 0.0))
+        per_tile[part] = pointing + share
+    run, best = np.zeros((2, len(points)))
+    for shares in per_tile:
+        run = np.maximum(run + shares, 0.0)
+        best = np.maximum(best, run)
+    return best, per_tile
+
+
+def _heard(
+    heard: np.ndarray, points: np.ndarray, delay: Delay, reach_s: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the ship was when what is heard `heard` s after CPA left it: m to starboard and ahead; its range times its rate."""
+    _, cpa_range, _, speed = points[:, :4].T
+    if reach_s is None:
+        ahead = speed * delay.emitted(heard, cpa_range, speed)
+        return cpa_range, ahead, speed * ahead
+    bends = points[:, 4:].T.reshape(-1, 2, 2, len(points))
+    emitted = heard
+    for _ in range(3):
+        side, ahead, _, _ = _departed(emitted, cpa_range, speed, bends, reach_s)
+        emitted = heard - delay(np.sqrt(side * side + ahead * ahead))
+    side, ahead, sideways, forwards = _departed(emitted, cpa_range, speed, bends, reach_s)
+    return side, ahead, side * sideways + ahead * forwards
+
+
+def _departed(
+    elapsed: np.ndarray, cpa_range: np.ndarray, speed: np.ndarray, bends: np.ndarray, reach_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Place [m] and velocity [m/s] to starboard and ahead at `elapsed` s after CPA; bends (term, direction, side of CPA, n)."""
+    after = elapsed >= 0
+    side, ahead, sideways, forwards = 0.0, elapsed, 0.0, 1.0
+    for term, (across, along) in enumerate(bends):
+        way, rise = departure(np.abs(elapsed), np.where(after, reach_s[1], reach_s[0]), term)
+        way = np.where(after, way, -way)
+        across, along = np.where(after, across[1], across[0]), np.where(after, along[1], along[0])
+        side, sideways = side + across * way, sideways + across * rise
+        ahead, forwards = ahead + along * way, forwards + along * rise
+    return cpa_range + speed * side, speed * ahead, speed * sideways, speed * forwards
