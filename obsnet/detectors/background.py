@@ -17,6 +17,9 @@ from obsnet.layout import to_posix
 class BackgroundDirection:
     """Mean phasor of each frequency over a window before now, renewed at UTC multiples of a step.
 
+    A ship that comes in keeps its azimuth for the better part of an hour, and where nothing older has been heard it looks like
+    a background. So the mean includes `prior_s` without any direction: what has been heard for as long counts half.
+
     Parameters
     ----------
     window_s, step_s : s. The output for a frame depends on whole steps before the frame's own alone, so that any split of a
@@ -24,8 +27,11 @@ class BackgroundDirection:
     bandwidth_hz : the mean is taken over this band too, because noise is broad and a ship's tones are narrow.
     """
 
-    def __init__(self, window_s: float, step_s: float, bandwidth_hz: float = 2.0) -> None:
+    def __init__(
+        self, window_s: float, step_s: float, bandwidth_hz: float = 2.0, prior_s: float = 3600.0
+    ) -> None:
         self.window_s, self.step_s, self.bandwidth_hz = window_s, step_s, bandwidth_hz
+        self.prior_s = prior_s
         self._sums: dict[int, np.ndarray] = {}
         self._counts: dict[int, int] = {}
 
@@ -62,14 +68,15 @@ class BackgroundDirection:
         for key in [key for key in self._sums if key < oldest]:
             del self._sums[key], self._counts[key]
         total = np.zeros(n_frequency, complex)
-        count = 0
+        count = heard = 0
         for key in sorted(self._sums):
             if key < step:
                 total += self._sums[key]
                 count += self._counts[key]
+                heard += 1
         if count == 0:
             return total
-        mean = total / count
+        mean = total / count * (heard / (heard + self.prior_s / self.step_s))
         held = np.pad(mean, (smooth_bins // 2, (smooth_bins - 1) // 2), mode="edge")
         return np.convolve(held, np.full(smooth_bins, 1.0 / smooth_bins), "valid")
 

@@ -172,17 +172,21 @@ def _check_same(prepared: PreparedSet, data: TwinData | ArchiveData) -> None:
 
 def _twin_jobs(data: TwinData) -> Iterator[tuple[str, str, int]]:
     """Records of the splits by turns, so that a set cut short holds all of them."""
-    counts = {"train": data.train, "validation": data.validation, "test": data.test}
     places = [
-        ((i + 0.5) / count, split, data.first_seed + i)
-        for split, count in counts.items()
+        ((i + 0.5) / count, split, kind, i)
+        for split, kind, count in (
+            ("train", "", data.train), ("validation", "", data.validation), ("test", "", data.test),
+            ("train", "quiet-", data.quiet_train), ("validation", "quiet-", data.quiet_validation),
+        )
         for i in range(count)
-    ]
-    for _, split, seed in sorted(places):
-        yield f"{split}-{seed:05d}", split, seed
-    for split, count in (("train", data.quiet_train), ("validation", data.quiet_validation)):
-        for i in range(count):
-            yield f"{split}-quiet-{i:05d}", split, data.first_seed + QUIET_SEEDS + i
+    ]  # fmt: skip
+    for _, split, kind, i in sorted(places):
+        seed = data.first_seed + i
+        yield (
+            f"{split}-{kind}{i if kind else seed:05d}",
+            split,
+            seed + QUIET_SEEDS if kind else seed,
+        )
 
 
 def _courses(name: str | None) -> pd.DataFrame | None:

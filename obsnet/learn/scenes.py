@@ -48,7 +48,8 @@ class SceneConfig:
     hours : length of a record.
     ship_shares : probabilities of 0, 1, 2 … ships in a record with drawn courses.
     real_course_share : share of the records whose ships follow AIS, where there is any.
-    source_level_db, source_level_spread_db : of the ships.
+    source_level_db, source_level_spread_db : of the ships. lineless_share : of ships that give broadband noise alone, which a
+        network must not take for the sea; the lines of the others lie `line_shift_db` above (or below) what the twin draws.
     orientation_error_deg : standard deviation of what StationXML says of the horizontals.
     without_z, without_hydrophone, without_horizontals : shares of records that lack a channel.
     start : first sample of the drawn records, ISO 8601; courses after AIS keep their own times.
@@ -59,6 +60,8 @@ class SceneConfig:
     real_course_share: float = 0.3
     source_level_db: float = 190.0
     source_level_spread_db: float = 6.0
+    lineless_share: float = 0.3
+    line_shift_db: tuple[float, float] = (-18.0, 3.0)
     orientation_error_deg: float = 2.0
     without_z: float = 0.15
     without_hydrophone: float = 0.1
@@ -128,8 +131,13 @@ def _components(generator: np.random.Generator, config: SceneConfig) -> str:
 
 def _ship(generator: np.random.Generator, seed: int, mmsi: int, config: SceneConfig) -> Ship:
     level = float(generator.normal(config.source_level_db, config.source_level_spread_db))
+    ship = Ship.random(seed, mmsi, level)
+    shift = float(generator.uniform(*config.line_shift_db))
+    lines = tuple(replace(s, levels_db=tuple(db + shift for db in s.levels_db)) for s in ship.lines)
     return replace(
-        Ship.random(seed, mmsi, level),
+        ship,
+        lines=() if generator.random() < config.lineless_share else lines,
+        level_spread_db=float(generator.uniform(0.3, 2.5)),
         peak_hz=float(generator.uniform(8.0, 30.0)),
         slope_db=float(generator.uniform(20.0, 40.0)),
         ripple_db=float(generator.uniform(0.5, 3.5)),
@@ -151,7 +159,7 @@ def _course(generator: np.random.Generator, start: float, hours: float) -> Cours
 
 
 def _ambient(generator: np.random.Generator) -> Ambient:
-    """A background of any level and direction; half of them with most of the noise from one side."""
+    """A background of any level and direction; half of them with most of the noise from one side, a point or a wide sector."""
     fraction = generator.uniform(0.0, 0.5) if generator.random() < 0.5 else generator.uniform(0.4, 0.95)
     return replace(
         Ambient.random(generator),
@@ -159,6 +167,7 @@ def _ambient(generator: np.random.Generator) -> Ambient:
         level_spread_db=float(generator.uniform(0.3, 3.0)),
         directional_fraction=float(fraction),
         directional_elevation_deg=float(generator.uniform(0.0, 50.0)),
+        directional_width_deg=float(generator.choice([0.0, generator.uniform(5.0, 60.0)], p=[0.15, 0.85])),
         horizontal_share=float(generator.uniform(0.2, 0.5)),
     )
 

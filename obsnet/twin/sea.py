@@ -34,9 +34,11 @@ class Ambient:
     microseism_hz : float
         Frequency of the peak.
     directional_fraction : float
-        Share of the sea noise's pressure power that comes from one azimuth.
+        Share of the sea noise's pressure power that comes from one side.
     directional_azimuth_deg : float
         Azimuth from the station to where that comes from.
+    directional_width_deg : float
+        Standard deviation of the azimuths that it comes from; 0 is one point, as of a single distant source.
     directional_elevation_deg : float
         Grazing angle at which it arrives.
     horizontal_share : float
@@ -69,6 +71,7 @@ class Ambient:
     seismometer_noise_db: float = -165.0
     tilt_noise_db: float = -125.0
     chorus_db: float = -np.inf
+    directional_width_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.directional_fraction <= 1:
@@ -130,19 +133,20 @@ def add_ambient(field: Field, first: int, sampling_rate: float, ambient: Ambient
 
     def colour(frequency: np.ndarray, z: np.ndarray) -> np.ndarray:
         gains = _Gains(ambient, frequency, sampling_rate)
-        directional = gains.directional * z[4]
-        east, north, down = gains.direction
-        pressure = gains.isotropic * z[0]
+        pressure, east, north, down = gains.directional * np.tensordot(directions, z[np.r_[4, 6 : len(z)]], 1)
+        isotropic = gains.isotropic * z[0]
         return np.stack(
             (
-                pressure + gains.hydrophone * z[5] + directional,
-                gains.horizontal * z[1] + directional * east,
-                gains.horizontal * z[2] + directional * north,
-                gains.vertical * z[3] + gains.coupled * z[0] + directional * down,
+                isotropic + gains.hydrophone * z[5] + pressure,
+                gains.horizontal * z[1] + east,
+                gains.horizontal * z[2] + north,
+                gains.vertical * z[3] + gains.coupled * z[0] + down,
             )
         )
 
-    noise = gaussian_noise((seed, 11), first, field.pressure.size, sampling_rate, colour, draws=6)
+    directions = _directions(ambient)
+    draws = 5 + directions.shape[1]
+    noise = gaussian_noise((seed, 11), first, field.pressure.size, sampling_rate, colour, draws=draws)
     gain = _level(ambient, seed, first, field.pressure.size, sampling_rate)
     for values, row in zip((field.pressure, field.east, field.north, field.down), noise, strict=True):
         values += row * gain
@@ -168,18 +172,33 @@ class _Gains:
         self.vertical = _amplitude((1 - coherence**2) * velocity / 3 + own, edge)
         self.coupled = _amplitude(coherence**2 * velocity / 3, edge)
         self.directional = _amplitude(directional, edge)
-        self.direction = _direction(ambient)
 
 
-def _direction(ambient: Ambient) -> tuple[np.float32, np.float32, np.float32]:
-    """Velocity east, north, down over pressure of a plane wave from the directional azimuth."""
-    azimuth, elevation = np.deg2rad([ambient.directional_azimuth_deg, ambient.directional_elevation_deg])
-    horizontal = -np.cos(elevation) / IMPEDANCE
-    return (
-        np.float32(horizontal * np.sin(azimuth)),
-        np.float32(horizontal * np.cos(azimuth)),
-        np.float32(np.sin(elevation) / IMPEDANCE),
+def _directions(ambient: Ambient) -> np.ndarray:
+    """Pressure, and velocity east, north, down over it, of independent parts of the directional noise (4, part), float32.
+
+    From one point it is a single plane wave. From a sector it is a sum of countless ones, Gaussian as they are: all that is left
+    of them is the covariance of the four channels, of which these columns are a root.
+    """
+    azimuth, elevation, width = np.deg2rad(
+        [
+            ambient.directional_azimuth_deg,
+            ambient.directional_elevation_deg,
+            ambient.directional_width_deg,
+        ]
     )
+    horizontal, down = -np.cos(elevation) / IMPEDANCE, np.sin(elevation) / IMPEDANCE
+    nodes = np.linspace(-3.0, 3.0, 61) if width else np.zeros(1)
+    weight = np.exp(-0.5 * nodes**2)
+    angle = azimuth + width * nodes
+    waves = np.stack(
+        [np.ones_like(angle), horizontal * np.sin(angle), horizontal * np.cos(angle), np.full_like(angle, down)]
+    ) * np.sqrt(weight / weight.sum())
+    if not width:
+        return waves.astype(np.float32)
+    scale = np.array([1.0, IMPEDANCE, IMPEDANCE, IMPEDANCE])[:, None]
+    vectors, values, _ = np.linalg.svd(scale * waves, full_matrices=False)
+    return (vectors * values / scale)[:, values > 1e-6].astype(np.float32)
 
 
 def _level(ambient: Ambient, seed: int, first: int, count: int, sampling_rate: float) -> np.ndarray:
