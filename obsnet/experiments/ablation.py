@@ -26,7 +26,7 @@ from obsnet.detectors.analytic import AzimuthDetectorConfig
 from obsnet.detectors.maps import detections, presence
 from obsnet.errors import ConfigError, ModelError
 from obsnet.evaluation import evaluate
-from obsnet.experiments.ablation_minutes import CELL_PRIOR, histograms, minute_table
+from obsnet.experiments.ablation_minutes import azimuth_nll, minute_table, range_nll, samples
 from obsnet.experiments.ablation_records import KINDS
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.output import write_text
@@ -68,6 +68,7 @@ ROWS: dict[str, Row] = {
     "learned both": Row("learned", "learned"),
 }
 VALIDATION_SEED = 1000
+SAMPLES = "samples.npz"
 
 
 def add_variant(name: str, sensor: str, model: str) -> None:
@@ -137,8 +138,8 @@ def _case(plan: Plan, folder: Path, case: tuple[str, str, int], wanted: list[str
         _keep(place, name, made, seconds)
     if "analytic" in runs and seed >= VALIDATION_SEED:
         truth = pd.read_csv(place / "truth.csv")
-        held: dict[str, Any] = {**histograms(runs["analytic"][0].maps, truth)}
-        np.savez_compressed(place / "histograms.npz", **held)
+        held: dict[str, Any] = {**samples(runs["analytic"][0].maps, truth)}
+        np.savez(place / SAMPLES, **held)
 
 
 def _key(name: str) -> str:
@@ -216,36 +217,40 @@ def _reference(place: Path, made: Run, truth: pd.DataFrame) -> list[ReferenceTra
 
 
 def recalibration(folder: str | Path) -> dict[str, tuple[float, float]]:
-    """Slope and offset for each sensor, fitted on the validation records' cells by maximum likelihood.
+    """Slope and offset for each sensor: those of least negative log posterior on the validation records.
 
     Returns
     -------
-    dict of (slope, offset): the recalibrated ratio is slope·llr + offset, a cell's prior `CELL_PRIOR`.
+    dict of (slope, offset): the recalibrated ratio is slope·llr + offset.
     """
-    total: dict[str, np.ndarray] = {}
-    for path in sorted(Path(folder).glob("*/*/histograms.npz")):
+    losses: dict[str, list[Callable[[float, float], np.ndarray]]] = {"azimuth": [], "range": []}
+    for path in sorted(Path(folder).glob(f"*/*/{SAMPLES}")):
         with np.load(path) as held:
-            for key in held.files:
-                total[key] = total.get(key, 0.0) + held[key]
-    fitted = {}
-    for sensor in ("azimuth", "range"):
-        if f"{sensor}_ship" in total:
-            fitted[sensor] = _fit(
-                total["centre"] / total["files"], total[f"{sensor}_ship"], total[f"{sensor}_none"]
-            )
-    return fitted
+            if "azimuth_llr" in held.files:
+                losses["azimuth"].append(_azimuth_loss(held["azimuth_llr"], held["azimuth_holds"]))
+            if "range_llr" in held.files:
+                losses["range"].append(
+                    _range_loss(held["range_llr"], held["range"], held["range_holds"], held["range_near"])
+                )
+    return {sensor: _fit(parts) for sensor, parts in losses.items() if parts}
 
 
-def _fit(centre: np.ndarray, ship: np.ndarray, none: np.ndarray) -> tuple[float, float]:
-    """Slope and offset that minimise the negative log likelihood of cells with and without a ship, at the prior's odds."""
-    weights = (CELL_PRIOR * ship / max(ship.sum(), 1.0), (1.0 - CELL_PRIOR) * none / max(none.sum(), 1.0))
-    odds = np.log(CELL_PRIOR / (1.0 - CELL_PRIOR))
+def _azimuth_loss(llr: np.ndarray, holds: np.ndarray) -> Callable[[float, float], np.ndarray]:
+    return lambda slope, offset: azimuth_nll(slope * llr + offset, holds)
 
+
+def _range_loss(
+    llr: np.ndarray, grid: np.ndarray, holds: np.ndarray, near: np.ndarray
+) -> Callable[[float, float], np.ndarray]:
+    return lambda slope, offset: range_nll(slope * llr.astype(np.float32) + offset, grid, holds, near)
+
+
+def _fit(parts: list[Callable[[float, float], np.ndarray]]) -> tuple[float, float]:
     def loss(parameters: np.ndarray) -> float:
-        logit = np.exp(parameters[0]) * centre + parameters[1] + odds
-        return float(weights[0] @ np.logaddexp(0.0, -logit) + weights[1] @ np.logaddexp(0.0, logit))
+        slope, offset = float(np.exp(parameters[0])), float(parameters[1])
+        return float(np.concatenate([part(slope, offset) for part in parts]).mean())
 
-    best = minimize(loss, np.array([-1.0, 0.0]), method="Nelder-Mead").x
+    best = minimize(loss, np.array([-1.0, 0.0]), method="Nelder-Mead", options={"fatol": 1e-5}).x
     return float(np.exp(best[0])), float(best[1])
 
 

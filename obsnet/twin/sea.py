@@ -192,7 +192,12 @@ def _directions(ambient: Ambient) -> np.ndarray:
     weight = np.exp(-0.5 * nodes**2)
     angle = azimuth + width * nodes
     waves = np.stack(
-        [np.ones_like(angle), horizontal * np.sin(angle), horizontal * np.cos(angle), np.full_like(angle, down)]
+        [
+            np.ones_like(angle),
+            horizontal * np.sin(angle),
+            horizontal * np.cos(angle),
+            np.full_like(angle, down),
+        ]
     ) * np.sqrt(weight / weight.sum())
     if not width:
         return waves.astype(np.float32)

@@ -96,6 +96,22 @@ def test_directional_share_of_the_noise_comes_from_its_azimuth(fraction):
     assert np.hypot(*flux) == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize("width", [10.0, 40.0])
+def test_noise_from_a_sector_points_to_its_middle_and_is_less_focused(width):
+    changed = {
+        "directional_fraction": 1.0, "directional_azimuth_deg": 212.0, "directional_width_deg": width,
+        "directional_elevation_deg": 0.0,
+    }  # fmt: skip
+    field = background(Ambient(**{**Ambient.isotropic(80.0).__dict__, **changed}))
+    east, north = IMPEDANCE * field.east, IMPEDANCE * field.north
+    flux = np.array([np.mean(field.pressure * east), np.mean(field.pressure * north)])
+    assert np.rad2deg(np.arctan2(-flux[0], -flux[1])) % 360.0 == pytest.approx(212.0, abs=1.5)
+    spread = np.deg2rad(width)
+    assert np.hypot(*flux) / np.var(field.pressure) == pytest.approx(np.exp(-(spread**2) / 2), rel=0.03)
+    across = np.var(east * np.cos(np.deg2rad(212.0)) - north * np.sin(np.deg2rad(212.0)))
+    assert across / np.var(field.pressure) == pytest.approx((1 - np.exp(-2 * spread**2)) / 2, rel=0.06)
+
+
 def test_chorus_adds_a_hump_at_the_whales_pitch():
     quiet = background(Ambient(level_spread_db=0.0))
     loud = background(Ambient(level_spread_db=0.0, chorus_db=96.0))
