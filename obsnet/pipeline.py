@@ -140,7 +140,9 @@ class Pipeline:
         self._range = _range_detector(config, self.table, expected, threads)
         self._clutter = ClutterFilter(config.cepstrogram)
         self._background = BackgroundDirection(
-            config.azimuth.background_window_s, config.azimuth.background_step_s
+            config.azimuth.background_window_s,
+            config.azimuth.background_step_s,
+            config.azimuth.background_prior_s,
         )
         self._azigram: xr.DataArray | None = None
         self._null: np.ndarray | None = None

@@ -49,7 +49,8 @@ class AzimuthDetectorConfig:
 
     `mean_resultant_length` is the focus expected of a ship (0.99: +40 dB, appendix B); `impulsive` suits whales and other
     short broadband sources. `null` is the density of cells without a ship: `uniform` as in the paper, or `directional`,
-    a wrapped Cauchy around the mean direction of each frequency over `background_window_s` before.
+    a wrapped Cauchy around the mean direction of each frequency over `background_window_s` before, of which what has been heard
+    for `background_prior_s` counts half.
     """
 
     window_s: float = 180.0
@@ -62,6 +63,7 @@ class AzimuthDetectorConfig:
     null: Literal["uniform", "directional"] = "directional"
     background_window_s: float = 21600.0
     background_step_s: float = 600.0
+    background_prior_s: float = 3600.0
 
     def __post_init__(self) -> None:
         _check_windows(self.window_s, self.step_s)
@@ -77,6 +79,8 @@ class AzimuthDetectorConfig:
                 "background_step_s must be positive and at most background_window_s, found "
                 f"{self.background_step_s} and {self.background_window_s} s"
             )
+        if not self.background_prior_s >= 0.0:
+            raise ConfigError(f"background_prior_s must not be negative, found {self.background_prior_s}")
 
     @property
     def azimuth(self) -> np.ndarray:

@@ -33,12 +33,15 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Band [Hz] of the cells, and memory [s] of the slow level and the background's direction."""
+    """Band [Hz] of the cells, memory [s] of the slow level and the background's direction, and how long [s] a direction must
+    have been heard to count half as background.
+    """
 
     fmin_hz: float = 11.0
     fmax_hz: float = 24.0
     memory_s: float = 21600.0
     memory_step_s: float = 600.0
+    background_prior_s: float = 3600.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,9 @@ class AzimuthFeatures:
 
     def __init__(self, config: FeatureConfig = FeatureConfig()) -> None:
         self.config = config
-        self._background = BackgroundDirection(config.memory_s, config.memory_step_s)
+        self._background = BackgroundDirection(
+            config.memory_s, config.memory_step_s, config.background_prior_s
+        )
         self._levels: dict[int, np.ndarray] = {}
         self._open: _Frames | None = None
         self._base: _Base | None = None

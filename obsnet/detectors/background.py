@@ -18,18 +18,17 @@ class BackgroundDirection:
     """Mean phasor of each frequency over a window before now, renewed at UTC multiples of a step.
 
     A ship that comes in keeps its azimuth for the better part of an hour, and where nothing older has been heard it looks like
-    a background. So the mean includes `prior_s` without any direction: what has been heard for as long counts half.
+    a background. So the mean includes `prior_s` without any direction.
 
     Parameters
     ----------
     window_s, step_s : s. The output for a frame depends on whole steps before the frame's own alone, so that any split of a
         record gives the same; it is 0 (no direction known) until one step has been heard.
+    prior_s : s. What has been heard for so long counts half.
     bandwidth_hz : the mean is taken over this band too, because noise is broad and a ship's tones are narrow.
     """
 
-    def __init__(
-        self, window_s: float, step_s: float, bandwidth_hz: float = 2.0, prior_s: float = 3600.0
-    ) -> None:
+    def __init__(self, window_s: float, step_s: float, prior_s: float, bandwidth_hz: float = 2.0) -> None:
         self.window_s, self.step_s, self.bandwidth_hz = window_s, step_s, bandwidth_hz
         self.prior_s = prior_s
         self._sums: dict[int, np.ndarray] = {}

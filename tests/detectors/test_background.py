@@ -20,18 +20,18 @@ def azigram(hours, azimuth_deg, begin_h=0.0):
 
 
 def test_a_ship_that_comes_in_for_half_an_hour_is_not_the_background():
-    heard = BackgroundDirection(21600.0, 600.0)(azigram(0.5, 40.0))
+    heard = BackgroundDirection(21600.0, 600.0, 3600.0)(azigram(0.5, 40.0))
     assert np.abs(heard).max() < 0.3
 
 
 def test_what_lasts_is_the_background():
-    heard = BackgroundDirection(21600.0, 600.0)(azigram(7.0, 40.0))
+    heard = BackgroundDirection(21600.0, 600.0, 3600.0)(azigram(7.0, 40.0))
     assert np.abs(heard[:, -1]) == pytest.approx(6 / 7, abs=0.01)
     assert np.rad2deg(np.angle(heard[:, -1])) == pytest.approx(40.0, abs=0.01)
 
 
 def test_any_split_gives_the_same():
-    whole = BackgroundDirection(21600.0, 600.0)(azigram(3.0, 40.0))
-    cut = BackgroundDirection(21600.0, 600.0)
+    whole = BackgroundDirection(21600.0, 600.0, 3600.0)(azigram(3.0, 40.0))
+    cut = BackgroundDirection(21600.0, 600.0, 3600.0)
     parts = [azigram(1.25, 40.0), azigram(1.75, 40.0, begin_h=1.25)]
     np.testing.assert_array_equal(whole, np.concatenate([cut(part) for part in parts], axis=1))
