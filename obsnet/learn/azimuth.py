@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from obsnet.detectors.azimuth_features import cell_index
+from obsnet.detectors.azimuth_features import CHANNELS, cell_index
 from obsnet.errors import ConfigError
 from obsnet.learn.dataset import NO_PHASOR, PreparedSet, Record
 
@@ -29,12 +29,15 @@ class AzimuthTaskConfig:
     beside_deg : half-width of the sector about an unknown or another ship that says nothing.
     prior_odds : odds of a ship against none in the training draws; only their removal from the output matters.
     forget_share : share of rows whose slow memory (level, background) is taken away, as after a station's start.
+    fade_share : share of rows whose lines and transients are weakened or strengthened: how much a ship's spectrum stands out and
+        flickers is the simulator's habit, which the network shall not lean on.
     """
 
     reach_m: float = 60e3
     beside_deg: float = 20.0
     prior_odds: float = 1.0
     forget_share: float = 0.15
+    fade_share: float = 0.5
 
 
 class AzimuthRows(Dataset):
@@ -123,7 +126,7 @@ def _labels(
 
 
 def augmented(batch: Batch, generator: torch.Generator, config: AzimuthTaskConfig) -> Batch:
-    """Rows turned, mirrored and, some of them, robbed of their memory: none changes what they should say."""
+    """Rows turned, mirrored and, some of them, robbed of their memory or their lines: none changes what they should say."""
     rows = batch["turn"].shape[0]
     turn = torch.rand(rows, generator=generator)
     mirrored = torch.rand(rows, generator=generator) < 0.5
@@ -138,11 +141,20 @@ def augmented(batch: Batch, generator: torch.Generator, config: AzimuthTaskConfi
         ],
         1,
     )
-    keep = torch.ones(1, 1, batch["invariants"].shape[2], 1)
-    keep[0, 0, [0, 10, 11]] = 0.0
-    invariants = torch.where(forgets[:, None, None, None], batch["invariants"] * keep, batch["invariants"])
+    gain = torch.ones(rows, 1, batch["invariants"].shape[2], 1)
+    gain[forgets, 0, :, 0] *= _without("level", "background", "agreement_background")
+    fades = torch.rand(rows, generator=generator) < config.fade_share
+    for name, most in (("line", 1.3), ("transience", 1.6)):
+        drawn = most * torch.rand(rows, generator=generator)
+        gain[:, 0, CHANNELS.index(name), 0] *= torch.where(fades, drawn, 1.0)
+    invariants = batch["invariants"] * gain
     turned = (batch["turn"] * sign + turn[:, None, None]) % 1.0
     return batch | {"phasor": phasor, "invariants": invariants, "turn": turned}
+
+
+def _without(*names: str) -> Tensor:
+    """1 for every channel but those named."""
+    return torch.tensor([float(name not in names) for name in CHANNELS])
 
 
 def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Tensor:
