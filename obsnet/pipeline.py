@@ -382,11 +382,14 @@ def _learned_azimuth(config: RunConfig) -> LearnedAzimuthDetector:
 def _range_detector(
     config: RunConfig, table: xr.Dataset, amplitudes: Amplitudes, threads: int | None
 ) -> AnalyticRangeDetector | LearnedRangeDetector:
+    analytic = AnalyticRangeDetector(table, amplitudes, config.range, threads)
     if config.detector in ("learned", "learned-range"):
         from obsnet.detectors.learned_range import LearnedRangeDetector
 
-        return LearnedRangeDetector.from_model(table, config.models.range, config.range, config.spectra)
-    return AnalyticRangeDetector(table, amplitudes, config.range, threads)
+        return LearnedRangeDetector.from_model(
+            table, config.models.range, config.range, config.spectra, shape=analytic
+        )
+    return analytic
 
 
 def _follower(table: xr.Dataset, amplitudes: Amplitudes | None) -> StationFocalization:

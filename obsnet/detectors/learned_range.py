@@ -2,8 +2,9 @@
 
 Every hypothesis of the grid gets the cheap score: the energy of the cepstrum along its predicted delays. Around that
 score's highest peaks the network gives the likelihood ratio; everywhere else a line through the cheap score does, fitted
-on validation records and bounded. A minute depends on the frames of its own window alone, so that maps do not depend on
-how a record is cut.
+on validation records and bounded. The network was trained with tables in error, so it says which lobe is the ship and
+hardly where in it: that the analytic likelihood says, within the reach of the network's blur. A minute depends on the frames
+of its own window alone, so that maps do not depend on how a record is cut.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import xarray as xr
 
 from obsnet.config import build
 from obsnet.detectors import range_kernels as kernels
-from obsnet.detectors.analytic import RangeDetectorConfig, range_maps
+from obsnet.detectors.analytic import AnalyticRangeDetector, RangeDetectorConfig, range_maps
 from obsnet.detectors.maps import coverage, hop, window_bounds
 from obsnet.detectors.model_card import ModelCard, ModelFile, check_shapes, run, shipped
 from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeatures, RangeFeaturesConfig
@@ -30,6 +31,8 @@ CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 END_SLOPE = 0.1
 """Slope of a minute's ratio of presence beyond the strongest evidence that validation held."""
+SHAPE_SLOPE, SHAPE_REACH_M, SHAPE_REACH_MPS = 0.15, 280.0, 2.0
+"""Power of the analytic likelihood ratio that shares out what the network gives to a lobe, and how far it moves it."""
 Scorer = Callable[[np.ndarray], np.ndarray]
 """Feature vectors (n, size) float32 in, log likelihood ratios (n) float32 out."""
 
@@ -84,6 +87,7 @@ class LearnedRangeDetector:
     scorer : the network.
     calibration, features : as the network was trained and calibrated.
     config : RangeDetectorConfig, of which the grids and the windows hold.
+    shape : detector of the fine shape; None leaves the network's blur.
     """
 
     name = "learned"
@@ -95,8 +99,9 @@ class LearnedRangeDetector:
         calibration: RangeCalibration = RangeCalibration(),
         features: RangeFeaturesConfig = RangeFeaturesConfig(),
         config: RangeDetectorConfig = RangeDetectorConfig(),
+        shape: AnalyticRangeDetector | None = None,
     ) -> None:
-        self.config, self.calibration = config, calibration
+        self.config, self.calibration, self._shape = config, calibration, shape
         self.window_s = config.window_s
         self.file: ModelFile | None = None
         self._scorer = scorer
@@ -110,12 +115,13 @@ class LearnedRangeDetector:
         config: RangeDetectorConfig = RangeDetectorConfig(),
         spectra: SpectraConfig = SpectraConfig(),
         threads: int | None = None,
+        shape: AnalyticRangeDetector | None = None,
     ) -> LearnedRangeDetector:
         """Detector of an ONNX file; by default of the one that is shipped.
 
         Parameters
         ----------
-        spectra : of the frames to come. threads : of onnxruntime.
+        spectra : of the frames to come. threads : of onnxruntime. shape : detector of the fine shape.
 
         Raises
         ------
@@ -131,7 +137,7 @@ class LearnedRangeDetector:
         def score(found: np.ndarray) -> np.ndarray:
             return run(session, {"features": found})
 
-        made = cls(propagation, score, calibration, features, config)
+        made = cls(propagation, score, calibration, features, config, shape)
         made.file = file
         return made
 
@@ -156,6 +162,13 @@ class LearnedRangeDetector:
             *_weights(config.range_rate, grid.range_rate),
             llr,
         )
+        if self._shape is not None:
+            fine = self._shape.maps(cepstrogram, minutes)["range_llr"].values
+            reach = (
+                round(SHAPE_REACH_M / config.range_step_m),
+                round(SHAPE_REACH_MPS / _step(config.range_rate)),
+            )
+            kernels.share_out(llr, fine, np.float32(SHAPE_SLOPE), *reach)
         times = to_posix(cepstrogram["time"].values)
         start, stop = window_bounds(times, minutes, config.window_s)
         covered = coverage(
@@ -184,6 +197,10 @@ class LearnedRangeDetector:
             said[cells] = self._scorer(found)
         kernels.carry_on(said, look.score, CARRIED_SLOPE)
         return said, look.score
+
+
+def _step(grid: np.ndarray) -> float:
+    return float(grid[1] - grid[0]) if len(grid) > 1 else 1.0
 
 
 def calibrated(

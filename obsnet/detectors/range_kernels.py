@@ -222,3 +222,56 @@ def resample(coarse, range_below, range_weight, rate_below, rate_weight, fine):
             for k in range(fine.shape[2]):
                 c, d = rate_below[k], rate_weight[k]
                 fine[w, i, k] = (np.float32(1.0) - d) * row[c] + d * row[c + 1]
+
+
+@njit(cache=True, nogil=True)
+def share_out(llr, shape, slope, reach_range, reach_rate):
+    """Give the ratios of each window the fine shape of another's, in place; what lies within a reach of a cell stays.
+
+    l ← log⟨e^l⟩ + s·a − log⟨e^(s·a)⟩, ⟨⟩ the mean over cells within the reach.
+
+    Parameters
+    ----------
+    llr, shape : (n_windows, n_range, n_rate) float32, of which `shape` is overwritten; windows with NaN are left alone.
+    slope : s. reach_range, reach_rate : cells to either side.
+    """
+    n_windows, n_range, n_rate = llr.shape
+    along, mean = np.empty((n_range, n_rate), np.float32), np.empty((n_range, n_rate), np.float32)
+    for w in range(n_windows):
+        if np.isnan(llr[w, 0, 0]) or np.isnan(shape[w, 0, 0]):
+            continue
+        shape[w] *= slope
+        _log_mean_exp(shape[w], reach_range, reach_rate, along, mean)
+        for i in range(n_range):
+            for k in range(n_rate):
+                shape[w, i, k] -= mean[i, k]
+        _log_mean_exp(llr[w], reach_range, reach_rate, along, mean)
+        for i in range(n_range):
+            for k in range(n_rate):
+                llr[w, i, k] = mean[i, k] + shape[w, i, k]
+
+
+@njit(cache=True, nogil=True)
+def _log_mean_exp(values, reach_range, reach_rate, along, mean):
+    """Logarithm of the mean of the exponentials within the reach of each cell, edges cut off: into `mean`.
+
+    Sums are made anew for each cell: a running one would lose what is small beside a peak that it has left.
+    """
+    n_range, n_rate = values.shape
+    top = values.max()
+    for i in range(n_range):
+        for k in range(n_rate):
+            mean[i, k] = np.exp(max(values[i, k] - top, np.float32(-80.0)))
+        along[i] = 0.0
+        for shift in range(-reach_rate, reach_rate + 1):
+            for k in range(max(-shift, 0), n_rate - max(shift, 0)):
+                along[i, k] += mean[i, k + shift]
+    for i in range(n_range):
+        mean[i] = 0.0
+        low, high = max(i - reach_range, 0), min(i + reach_range + 1, n_range)
+        for j in range(low, high):
+            for k in range(n_rate):
+                mean[i, k] += along[j, k]
+        for k in range(n_rate):
+            cells = (high - low) * (min(k + reach_rate + 1, n_rate) - max(k - reach_rate, 0))
+            mean[i, k] = np.log(mean[i, k] / np.float32(cells)) + top

@@ -140,3 +140,24 @@ def test_presence_goes_through_its_knots(table, cepstra):
     np.testing.assert_allclose(seen, -1.0 + 3.0 * (said - low) / (high - low), atol=1e-3)
     with pytest.raises(ConfigError, match="increasing knots"):
         replace(plain, presence_said=(1.0, 0.0))
+
+
+def test_a_lobe_keeps_its_mass_and_takes_the_analytic_shape():
+    llr = np.zeros((1, 60, 21), np.float32)
+    llr[0, 25:36, 5:16] = 6.0
+    shape = np.zeros((1, 60, 21), np.float32)
+    shape[0, 28, 11] = 40.0
+    shape[0, 50, 3] = 80.0
+    before = np.exp(llr.astype(float)).sum()
+    kernels.share_out(llr, shape.copy(), np.float32(0.15), 4, 4)
+    assert np.unravel_index(llr[0].argmax(), llr[0].shape) == (28, 11)
+    assert np.exp(llr.astype(float)).sum() == pytest.approx(before, rel=0.25)
+    assert llr[0, 50, 3] < llr[0, 28, 11] - 3.0
+
+
+def test_a_flat_shape_and_missing_minutes_change_nothing():
+    llr = np.zeros((2, 12, 7), np.float32)
+    llr[1] = np.nan
+    kernels.share_out(llr, np.full((2, 12, 7), -3.0, np.float32), np.float32(0.15), 4, 2)
+    np.testing.assert_allclose(llr[0], 0.0, atol=1e-5)
+    assert np.isnan(llr[1]).all()
