@@ -159,15 +159,15 @@ def _course(generator: np.random.Generator, start: float, hours: float) -> Cours
 
 
 def _ambient(generator: np.random.Generator) -> Ambient:
-    """A background of any level and direction; half of them with most of the noise from one side, a point or a wide sector."""
-    fraction = generator.uniform(0.0, 0.5) if generator.random() < 0.5 else generator.uniform(0.4, 0.95)
+    """A background of any level and direction; two in five with most of the noise from a sector."""
+    fraction = generator.uniform(0.0, 0.4) if generator.random() < 0.6 else generator.uniform(0.3, 0.9)
     return replace(
         Ambient.random(generator),
         level_db=float(generator.uniform(70.0, 88.0)),
         level_spread_db=float(generator.uniform(0.3, 3.0)),
         directional_fraction=float(fraction),
         directional_elevation_deg=float(generator.uniform(0.0, 50.0)),
-        directional_width_deg=float(generator.choice([0.0, generator.uniform(5.0, 60.0)], p=[0.15, 0.85])),
+        directional_width_deg=float(generator.uniform(10.0, 60.0)),
         horizontal_share=float(generator.uniform(0.2, 0.5)),
     )
 
