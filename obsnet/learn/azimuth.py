@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from obsnet.detectors.azimuth_features import CHANNELS, cell_index
 from obsnet.errors import ConfigError
-from obsnet.learn.dataset import NO_PHASOR, PreparedSet, Record
+from obsnet.learn.dataset import NO_PHASOR, JoinedSets, PreparedSet, Record
 
 ROW_MINUTES = 10
 ROW_CELLS = 3 * (ROW_MINUTES + 2)
@@ -50,7 +50,7 @@ class AzimuthRows(Dataset):
 
     def __init__(
         self,
-        prepared: PreparedSet,
+        prepared: PreparedSet | JoinedSets,
         split: str,
         config: AzimuthTaskConfig = AzimuthTaskConfig(),
         ships: int = 4,

@@ -15,7 +15,7 @@ from obsnet.detectors.azimuth_features import FeatureConfig
 from obsnet.errors import ConfigError
 from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig, Batch, augmented, loss
 from obsnet.learn.calibration import Calibration, apply, calibrate, metrics, outputs
-from obsnet.learn.dataset import PreparedSet
+from obsnet.learn.dataset import JoinedSets, PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters
 from obsnet.learn.prepare import provenance
 from obsnet.learn.task import TrainerConfig, fit, load_weights, save_weights, seeded
@@ -38,7 +38,7 @@ class AzimuthProblem:
 
 
 def train(
-    prepared: PreparedSet,
+    prepared: PreparedSet | JoinedSets,
     folder: str | Path,
     network: AzimuthNetworkConfig = AzimuthNetworkConfig(),
     labels: AzimuthTaskConfig = AzimuthTaskConfig(),
@@ -66,7 +66,7 @@ def train(
 
 
 def finetune(
-    prepared: PreparedSet,
+    prepared: PreparedSet | JoinedSets,
     folder: str | Path,
     weights: str | Path,
     labels: AzimuthTaskConfig = AzimuthTaskConfig(),
@@ -130,7 +130,7 @@ def prior_odds(rows: AzimuthRows) -> float:
 
 def finish(
     network: AzimuthNetwork,
-    prepared: PreparedSet,
+    prepared: PreparedSet | JoinedSets,
     folder: str | Path,
     labels: AzimuthTaskConfig,
     trainer: TrainerConfig,

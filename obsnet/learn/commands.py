@@ -67,12 +67,12 @@ def prepare_records(config: DictConfig) -> None:
 
 def train_detector(config: DictConfig) -> float:
     """Train (or, with ``config.weights``, adapt) the detector that ``config.task`` names; returns its validation loss."""
-    from obsnet.learn.dataset import PreparedSet
+    from obsnet.learn.dataset import JoinedSets, PreparedSet
     from obsnet.learn.task import TrainerConfig
 
     values = plain(config)
     folders = values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
-    prepared, folder = PreparedSet(folders[0]), Path(values["out"])
+    folder = Path(values["out"])
     trainer = build(TrainerConfig, values["trainer"], "trainer")
     about = {"resolved": values | {key: _names(values.get(key)) for key in PLACES}}
     if values["task"] == "azimuth":
@@ -80,6 +80,7 @@ def train_detector(config: DictConfig) -> float:
         from obsnet.learn.azimuth import AzimuthTaskConfig
         from obsnet.learn.networks import AzimuthNetworkConfig
 
+        prepared = JoinedSets(folders)
         labels = build(AzimuthTaskConfig, values["labels"], "labels")
         if values.get("weights"):
             found = training.finetune(prepared, folder, values["weights"], labels, trainer, about, say)

@@ -26,10 +26,11 @@ AIS does not show is then unknown, not "no ship".
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,26 @@ class PreparedSet:
         from obsnet.output import write_text
 
         write_text(self.folder / "provenance.json", json.dumps(provenance, indent=1, default=str))
+
+
+class JoinedSets:
+    """Prepared folders used as one, to train on."""
+
+    def __init__(self, folders: Sequence[str | Path]) -> None:
+        self.sets = [PreparedSet(folder) for folder in folders]
+
+    @property
+    def folder(self) -> str:
+        """Names of the folders."""
+        return ", ".join(str(held.folder) for held in self.sets)
+
+    def records(self, split: str | None = None, only: tuple[str, ...] | None = None) -> Iterator[Record]:
+        """Records of a split, folder by folder."""
+        return itertools.chain.from_iterable(held.records(split, only) for held in self.sets)
+
+    def digest(self) -> str:
+        """Digests of the folders."""
+        return " ".join(held.digest() for held in self.sets)
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
