@@ -52,17 +52,20 @@ class BentCourse(StraightCourse):
 
     The departure is a share of the speed, to starboard (`across`) and ahead (`along`): the first terms of a random walk of the
     velocity (Karhunen–Loève), sin((k − ½)π s/S) at s after or before CPA up to S and constant beyond. The first term holds 99 % of
-    the variance of the ship's place at S, the first two 90 % of that of its velocity.
+    the variance of the ship's place at S, the first two 90 % of that of its velocity. A ship may also turn once.
 
     Attributes
     ----------
     reach_s : S before and after CPA, s.
     across, along : (term, side) shares of the speed, before and after CPA.
+    turn_s, turn_deg : time after CPA (before it if negative) beyond which, seen from CPA, the course is another by so much.
     """
 
     reach_s: tuple[float, float] = (3600.0, 3600.0)
     across: tuple[tuple[float, float], ...] = ()
     along: tuple[tuple[float, float], ...] = ()
+    turn_s: float = 0.0
+    turn_deg: float = 0.0
 
     def position(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """East and north [m] of the ship relative to the station at `time` [s since 1970]."""
@@ -94,6 +97,14 @@ class BentCourse(StraightCourse):
             sideways += np.asarray(across)[after] * rise
             ahead += np.asarray(along)[after] * way
             forwards += np.asarray(along)[after] * rise
+        beyond = (
+            np.maximum(elapsed - self.turn_s, 0.0)
+            if self.turn_s >= 0
+            else np.minimum(elapsed - self.turn_s, 0.0)
+        )
+        sine, cosine = np.sin(np.deg2rad(self.turn_deg)), np.cos(np.deg2rad(self.turn_deg))
+        side, ahead = side + sine * beyond, ahead + (cosine - 1.0) * beyond
+        sideways, forwards = sideways + sine * (beyond != 0), forwards + (cosine - 1.0) * (beyond != 0)
         v = self.speed_mps
         return self.cpa_range_m + v * side, v * ahead, v * sideways, v * forwards
 

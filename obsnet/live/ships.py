@@ -235,7 +235,9 @@ def _said(track: Track) -> dict[str, Any]:
         "start": track.start,
         "end": track.end,
         "motion": [motion.cpa_time, motion.cpa_range_m, motion.course_deg, motion.speed_mps],
-        "bends": [motion.reach_s, motion.across, motion.along] if isinstance(motion, BentCourse) else None,
+        "bends": [motion.reach_s, motion.across, motion.along, motion.turn_s, motion.turn_deg]
+        if isinstance(motion, BentCourse)
+        else None,
         "covariance": [[float(v) if math.isfinite(v) else None for v in row] for row in track.covariance],
         "log_bayes_factor": track.log_bayes_factor,
         "method": track.method,
@@ -246,7 +248,10 @@ def _track(said: dict[str, Any]) -> Track:
     covariance = np.array([[math.inf if v is None else v for v in row] for row in said["covariance"]])
     motion = StraightCourse(*said["motion"])
     if said.get("bends"):
-        (before, after), *terms = said["bends"]
+        (before, after), *terms, turn_s, turn_deg = said["bends"]
         across, along = (tuple((float(a), float(b)) for a, b in term) for term in terms)
-        motion = replace(BentCourse(*said["motion"]), reach_s=(before, after), across=across, along=along)
+        turn = {"turn_s": turn_s, "turn_deg": turn_deg}
+        motion = replace(
+            BentCourse(*said["motion"]), reach_s=(before, after), across=across, along=along, **turn
+        )
     return Track(said["start"], said["end"], motion, covariance, said["log_bayes_factor"], said["method"])

@@ -17,7 +17,7 @@ import xarray as xr
 
 from obsnet.errors import ConfigError
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
-from obsnet.trackers.bends import MARGIN_S, bends
+from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
 from obsnet.trackers.course_grid import CourseGrid, Delay, best_first, score_points
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import (
@@ -301,7 +301,7 @@ class _Finder:
 
         config = self.config
         found = bends(straight, log_likelihood, self._inside, reach, samples=config.samples, seed=config.seed)
-        mean = found.mean if found.bent else straight.mean
+        mean = found.mean
         changes: dict[str, Any] = {"covariance": self._of_table(found.covariance, mean)}
         if found.bent:
             score, per_tile = log_likelihood(mean[None])
@@ -321,8 +321,10 @@ class _Finder:
         state = (self.origin + float(mean[0]), float(mean[1]), float(mean[2] % 360.0), float(mean[3]))
         if reach is None:
             return StraightCourse(*state)
-        across, along = mean[4:].reshape(-1, 2, 2).transpose(1, 0, 2).tolist()
-        return BentCourse(*state, tuple(reach.tolist()), tuple(map(tuple, across)), tuple(map(tuple, along)))
+        across, along = mean[BENDS].reshape(-1, 2, 2).transpose(1, 0, 2).tolist()
+        turn_s, turn_deg = mean[TURN].tolist()
+        terms = tuple(map(tuple, across)), tuple(map(tuple, along))
+        return BentCourse(*state, tuple(reach.tolist()), *terms, turn_s, turn_deg)
 
     def _of_table(self, covariance: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """The covariance with the propagation table's own error: it scales CPA range and speed alike."""

@@ -1,5 +1,7 @@
 """Courses that bend: the truth at CPA lies in the stated regions as often as said, and a straight ship stays straight."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,8 +72,8 @@ def measured(rng, ship):
 def course_of(point):
     if len(point) == 4:
         return StraightCourse(*point)
-    across, along = point[4:].reshape(2, 2, 2).transpose(1, 0, 2)
-    return BentCourse(*point[:4], tuple(REACH), across, along)
+    across, along = point[4:12].reshape(2, 2, 2).transpose(1, 0, 2)
+    return BentCourse(*point[:4], tuple(REACH), across, along, *point[12:])
 
 
 def found(rng, ship):
@@ -116,49 +118,55 @@ def test_prior_grows_as_a_random_walk():
     assert wander(np.array([3600.0, 3600.0]))[4] == pytest.approx(WANDER / 3.0)
 
 
+TURNING = replace(BENT, turn_s=1810.0, turn_deg=-35.0)
+
+
 def test_bent_course_without_bends_is_straight_and_its_rate_is_the_ranges_slope():
     time = T0 + np.linspace(0.0, 14_000.0, 57)
     straight = StraightCourse(T0 + 7000.0, 9_000.0, 60.0, 8.0)
     none = BentCourse(T0 + 7000.0, 9_000.0, 60.0, 8.0, (5400.0, 5400.0))
     np.testing.assert_allclose(none.observables(time), straight.observables(time))
     np.testing.assert_allclose(none.position(time), straight.position(time), atol=1e-6)
-    _, distance, rate = BENT.observables(time)
-    slope = (BENT.observables(time + 1.0)[1] - BENT.observables(time - 1.0)[1]) / 2.0
-    np.testing.assert_allclose(rate, slope, atol=1e-3)
-    np.testing.assert_allclose(np.hypot(*BENT.position(time)), distance)
-    assert time[distance.argmin()] == BENT.cpa_time
+    for course in (BENT, TURNING, replace(TURNING, turn_s=-1510.0)):
+        _, distance, rate = course.observables(time)
+        slope = (course.observables(time + 1.0)[1] - course.observables(time - 1.0)[1]) / 2.0
+        np.testing.assert_allclose(rate, slope, atol=1e-3)
+        np.testing.assert_allclose(np.hypot(*course.position(time)), distance)
+        assert time[distance.argmin()] == course.cpa_time
 
 
-def test_scores_put_the_ship_where_the_course_does():
+@pytest.mark.parametrize("course", [BENT, TURNING, replace(TURNING, turn_s=-1510.0)])
+def test_scores_put_the_ship_where_the_course_does(course):
     """A map that is a known function of range, range rate and azimuth scores what the course's observables say."""
     tiles = 180.0 * np.arange(70)
     range_m, rate = 70.0 * np.arange(715), 0.5 * np.arange(-26, 27)
     score = (1e-3 * range_m[:, None] + 0.1 * rate[None, :] + 10.0).astype(np.float32)
     pointing = np.cos(np.deg2rad(np.arange(360.0))).astype(np.float32)
-    point = np.concatenate([[7000.0, 9_000.0, 60.0, 8.0], *(
-        [*across, *along] for across, along in zip(BENT.across, BENT.along, strict=True)
-    )])  # fmt: skip
+    terms = [[*across, *along] for across, along in zip(course.across, course.along, strict=True)]
+    point = np.concatenate([[7000.0, 9_000.0, 60.0, 8.0], *terms, [course.turn_s, course.turn_deg]])
     scores = ScoreMaps(
         np.repeat(score[None], len(tiles), 0), np.array([0.0, 70.0, -13.0, 0.5]),
         np.repeat(pointing[None], len(tiles), 0), 1.0, jointly=False,
     )  # fmt: skip
     table = Delay(delay(np.arange(0.0, 150_001.0, 250.0)), 250.0)
-    out, per_tile = score_points(point[None], tiles, table, scores, np.array(BENT.reach_s))
+    out, per_tile = score_points(point[None], tiles, table, scores, np.array(course.reach_s))
     emitted = T0 + tiles
     for _ in range(30):
-        emitted = T0 + tiles - delay(BENT.observables(emitted)[1])
-    azimuth, distance, speed = BENT.observables(emitted)
+        emitted = T0 + tiles - delay(course.observables(emitted)[1])
+    azimuth, distance, speed = course.observables(emitted)
     expected = np.where(distance < 49_900.0, 1e-3 * distance + 0.1 * speed + 10.0, 0.0)
     np.testing.assert_allclose(per_tile[:, 0], expected + np.cos(np.deg2rad(azimuth)), atol=0.02)
     assert out[0] >= per_tile.sum() - 1e-3  # the best run of tiles
 
 
-def test_search_finds_a_bent_course_at_its_cpa():
-    (track, *others) = search(maps_of([BENT], MINUTES, np.random.default_rng(1)), SEGMENT, delay)
-    m = track.motion
-    assert isinstance(m, BentCourse) and not others
-    error = np.array([m.cpa_time - BENT.cpa_time, m.cpa_range_m - 9_000.0, wrap180(m.course_deg - 60.0),
-                      m.speed_mps - 8.0])  # fmt: skip
+@pytest.mark.parametrize("course", [BENT, TURNING, replace(TURNING, turn_s=-1510.0, turn_deg=50.0)])
+def test_search_finds_a_ship_that_bends_or_turns_once_and_at_its_cpa(course):
+    (track, *others) = search(maps_of([course], MINUTES, np.random.default_rng(1)), SEGMENT, delay)
+    found = track.motion
+    assert isinstance(found, BentCourse) and not others
+    error = np.array([found.cpa_time - course.cpa_time, found.cpa_range_m - 9_000.0,
+                      wrap180(found.course_deg - 60.0), found.speed_mps - 8.0])  # fmt: skip
     assert error @ np.linalg.solve(track.covariance, error) < 13.3  # 99 %
+    assert found.turn_s == pytest.approx(course.turn_s, abs=300.0)
     for time in (T0 + 1500.0, T0 + 12_500.0):
-        assert np.hypot(*np.subtract(m.position(time), BENT.position(time))) < 1000.0
+        assert np.hypot(*np.subtract(found.position(time), course.position(time))) < 1000.0
