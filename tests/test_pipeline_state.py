@@ -55,7 +55,7 @@ def test_what_is_complete_stays_the_same_object(blocks):
         pipeline.push(block)
     after = pipeline.state()
     kept = [name for name in after if after[name] is before.get(name)]
-    assert any(name.startswith("clutter/moment/") for name in kept)
+    assert any(name.startswith("clutter/frames/") for name in kept)
     assert any(name.startswith("background/sum/") for name in kept)
 
 

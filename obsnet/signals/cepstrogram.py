@@ -102,11 +102,11 @@ class ClutterFilter:
 
     def __init__(self, config: CepstrogramConfig = CepstrogramConfig()) -> None:
         self.config = config
-        self._steps: dict[int, _Step] = {}
-        self._held = _Step(0, np.zeros(()))
+        self._frames: dict[int, np.ndarray] = {}
+        self._held = _Moment(0, np.zeros(()))
         self._learned: np.ndarray | None = None
         self._learned_step: int | None = None
-        self._early = _Step(0, np.zeros(()))
+        self._early = _Moment(0, np.zeros(()))
 
     def __call__(self, cepstra: xr.DataArray) -> xr.DataArray:
         """Filter the next block of frames, dims (quefrency, time); blocks must come in time order."""
@@ -128,9 +128,7 @@ class ClutterFilter:
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next frame depends on, as arrays that are never changed in place."""
-        counts = [(step, held.count) for step, held in self._steps.items()]
-        arrays = {f"moment/{step}": held.moment for step, held in self._steps.items()}
-        arrays["counts"] = np.array(counts, np.int64).reshape(-1, 2)
+        arrays = {f"frames/{step}": frames for step, frames in self._frames.items()}
         arrays["held"], arrays["held_count"] = self._held.moment, np.array(self._held.count)
         arrays["early"], arrays["early_count"] = self._early.moment, np.array(self._early.count)
         if self._learned is not None:
@@ -141,10 +139,10 @@ class ClutterFilter:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on where `state` was taken."""
-        counts = {int(step): int(count) for step, count in state["counts"]}
-        self._steps = {step: _Step(count, state[f"moment/{step}"]) for step, count in counts.items()}
-        self._held = _Step(int(state["held_count"]), state["held"])
-        self._early = _Step(int(state["early_count"]), state["early"])
+        kept = sorted(int(name.removeprefix("frames/")) for name in state if name.startswith("frames/"))
+        self._frames = {step: state[f"frames/{step}"] for step in kept}
+        self._held = _Moment(int(state["held_count"]), state["held"])
+        self._early = _Moment(int(state["early_count"]), state["early"])
         self._learned = state.get("learned")
         self._learned_step = int(state["learned_step"]) if "learned_step" in state else None
 
@@ -163,12 +161,12 @@ class ClutterFilter:
 
     def _learn(self, step: int) -> None:
         oldest = step - round(self.config.clutter_window_s / self.config.clutter_step_s)
-        for key in [key for key in self._steps if key < oldest]:
-            self._held = self._held - self._steps.pop(key)
+        for key in [key for key in self._frames if key < oldest]:
+            self._held = self._held - self._moment(self._frames.pop(key))
         count = self._held.count
         self._learned_step = step
         if count < self.WARM_UP_FRAMES:
-            self._learned, self._early = None, _Step(0, np.zeros(()))
+            self._learned, self._early = None, _Moment(0, np.zeros(()))
         elif self.config.clutter == "svd":
             self._learned = leading_basis(self._held.moment, count)
         else:
@@ -188,35 +186,37 @@ class ClutterFilter:
         before = np.broadcast_to(self._early.moment, (1, frames.shape[1]))
         total = np.cumsum(np.concatenate([before, heard]), axis=0)
         count = self._early.count + np.concatenate([[0], np.cumsum(valid)])
-        self._early = _Step(int(count[-1]), total[-1])
+        self._early = _Moment(int(count[-1]), total[-1])
         number = count[:-1, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             off = (frames - total[:-1] / number) * np.sqrt(number / (number + 1.0))
         return off.astype(frames.dtype)
 
     def _remember(self, step: int, frames: np.ndarray) -> None:
-        valid = frames[~np.isnan(frames[:, 0])].astype(float)
-        if not len(valid):  # a dead hydrophone shall not fill the memory with Gram matrices of nothing
+        valid = frames[~np.isnan(frames[:, 0])]
+        if not len(valid):
             return
-        moment = valid.T @ valid if self.config.clutter == "svd" else valid.sum(axis=0)
-        new = _Step(len(valid), moment)
-        held = self._steps.get(step)
-        self._steps[step] = new if held is None else held + new
-        self._held = self._held + new
+        held = self._frames.get(step)
+        self._frames[step] = valid if held is None else np.concatenate([held, valid])
+        self._held = self._held + self._moment(valid)
+
+    def _moment(self, frames: np.ndarray) -> _Moment:
+        exact = frames.astype(float)
+        return _Moment(len(exact), exact.T @ exact if self.config.clutter == "svd" else exact.sum(axis=0))
 
 
 @dataclass(frozen=True)
-class _Step:
-    """What the filter keeps of one step: how many frames, and their Gram matrix over quefrency (or their sum)."""
+class _Moment:
+    """How many frames, and their Gram matrix over quefrency (or their sum)."""
 
     count: int
     moment: np.ndarray
 
-    def __add__(self, other: _Step) -> _Step:
-        return _Step(self.count + other.count, self.moment + other.moment)
+    def __add__(self, other: _Moment) -> _Moment:
+        return _Moment(self.count + other.count, self.moment + other.moment)
 
-    def __sub__(self, other: _Step) -> _Step:
-        return _Step(self.count - other.count, self.moment - other.moment)
+    def __sub__(self, other: _Moment) -> _Moment:
+        return _Moment(self.count - other.count, self.moment - other.moment)
 
 
 def leading_basis(gram: np.ndarray, count: int, guess: int = 32) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from obsnet.errors import LayoutError
 
@@ -36,21 +35,13 @@ class AzimuthGrid:
 
     def __call__(self, row: np.ndarray, azimuth_deg: np.ndarray) -> np.ndarray:
         """Linear interpolation of `row` (azimuth,); minus infinity outside a sector."""
-        return _interpolated(row, azimuth_deg, self.first_deg, self.step_deg, self.circular)
-
-
-@njit(cache=True, nogil=True)
-def _interpolated(row, azimuth_deg, first, step, circular):
-    count = len(row)
-    out = np.empty(len(azimuth_deg))
-    for i in range(len(azimuth_deg)):
-        position = (azimuth_deg[i] - first) / step
-        if circular:
+        count = len(row)
+        position = (np.asarray(azimuth_deg, float) - self.first_deg) / self.step_deg
+        if self.circular:
             position %= count
-        elif not 0.0 <= position <= count - 1:
-            out[i] = -np.inf
-            continue
-        cell = min(int(position), count - 1 if circular else count - 2)
+        inside = (position >= 0.0) & (position <= (count if self.circular else count - 1))
+        position = np.where(inside, position, 0.0)
+        cell = np.minimum(position.astype(np.int64), count - 1 if self.circular else count - 2)
         right = position - cell
-        out[i] = (1.0 - right) * row[cell] + right * row[(cell + 1) % count]
-    return out
+        between = (1.0 - right) * row[cell] + right * row[(cell + 1) % count]
+        return np.where(inside, between, -np.inf)

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from obsnet.errors import ConfigError, LayoutError
 from obsnet.trackers.azimuth_grid import AzimuthGrid
@@ -358,17 +357,22 @@ def _measured(
     return None if np.isnan(values).all() else tempered(values, weight, detection)
 
 
-@njit(cache=True, nogil=True)
-def _bilinear(chart, distance, rate, first_range, range_step, first_rate, rate_step):
-    out = np.zeros(len(distance))
-    for i in range(len(distance)):
-        x = (distance[i] - first_range) / range_step
-        y = (rate[i] - first_rate) / rate_step
-        if not (0.0 <= x <= chart.shape[0] - 1 and 0.0 <= y <= chart.shape[1] - 1):
-            continue
-        a, b = min(int(x), chart.shape[0] - 2), min(int(y), chart.shape[1] - 2)
-        u, v = x - a, y - b
-        low = (1.0 - v) * chart[a, b] + v * chart[a, b + 1]
-        high = (1.0 - v) * chart[a + 1, b] + v * chart[a + 1, b + 1]
-        out[i] = (1.0 - u) * low + u * high
-    return out
+def _bilinear(
+    chart: np.ndarray,
+    distance: np.ndarray,
+    rate: np.ndarray,
+    first_range: float,
+    range_step: float,
+    first_rate: float,
+    rate_step: float,
+) -> np.ndarray:
+    """Values of `chart` (range, rate) between its nodes; 0 off it."""
+    x, y = (distance - first_range) / range_step, (rate - first_rate) / rate_step
+    last = np.array(chart.shape) - 1
+    inside = (x >= 0.0) & (x <= last[0]) & (y >= 0.0) & (y <= last[1])
+    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+    a, b = np.minimum(x.astype(np.int64), last[0] - 1), np.minimum(y.astype(np.int64), last[1] - 1)
+    u, v = x - a, y - b
+    low = (1.0 - v) * chart[a, b] + v * chart[a, b + 1]
+    high = (1.0 - v) * chart[a + 1, b] + v * chart[a + 1, b + 1]
+    return np.where(inside, (1.0 - u) * low + u * high, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from obsnet.errors import FilterError
 
@@ -128,35 +127,16 @@ def _death(log_weights: np.ndarray, total: float, what: str) -> str:
     )
 
 
-@njit(cache=True, nogil=True)
-def _log_total(log_weights):
+def _log_total(log_weights: np.ndarray) -> float:
     """NaN where a weight is, infinite where one is infinite or all are zero."""
-    peak = -np.inf
-    for weight in log_weights:
-        if np.isnan(weight):
-            return weight
-        if weight > peak:
-            peak = weight
-    if np.isinf(peak):
+    peak = float(log_weights.max())
+    if not np.isfinite(peak):
         return peak
-    total = 0.0
-    for weight in log_weights:
-        total += np.exp(weight - peak)
-    return peak + np.log(total)
+    return peak + float(np.log(np.exp(log_weights - peak).sum()))
 
 
-@njit(cache=True, nogil=True)
-def _systematic(weights, offset, count):
-    indices = np.empty(count, np.int64)
-    last = len(weights) - 1
-    while last > 0 and weights[last] == 0.0:
-        last -= 1
-    particle = 0
-    cumulated = weights[0]
-    for pointer in range(count):
-        position = (pointer + offset) / count
-        while cumulated <= position and particle < last:
-            particle += 1
-            cumulated += weights[particle]
-        indices[pointer] = particle
-    return indices
+def _systematic(weights: np.ndarray, offset: float, count: int) -> np.ndarray:
+    """The particle whose stretch of the cumulated weights each pointer falls into; never one of no weight at their end."""
+    last = int(np.flatnonzero(weights)[-1])
+    pointers = (np.arange(count) + offset) / count
+    return np.minimum(np.searchsorted(np.cumsum(weights), pointers, side="right"), last)

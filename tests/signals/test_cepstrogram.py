@@ -120,7 +120,7 @@ def test_a_dead_hydrophone_leaves_nothing_in_memory():
     cepstra.values[:] = np.nan
     filtering = ClutterFilter()
     assert np.isnan(filtering(cepstra).values).all()
-    assert not filtering._steps
+    assert not filtering._frames
 
 
 def test_basis_is_the_leading_singular_vectors():
