@@ -18,8 +18,8 @@ lint: $(TEST)/.done
 	$(TEST)/bin/mypy
 	$(TEST)/bin/lint-imports
 
-bench: $(TEST)/.done
-	$(TEST)/bin/python tests/bench/bench.py
+bench: $(TEST)/.done $(DEMO)/.done
+	$(TEST)/bin/python tests/bench/bench.py --python $(DEMO)/bin/python
 
 $(DEMO)/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEMO)

@@ -1,8 +1,9 @@
 """Benchmarks as ratios measured in one run: ``make bench``.
 
-    python tests/bench/bench.py [--hours 8] [--repeat 3] [--no-obsea] [--no-day] [--no-experiments]
+    python tests/bench/bench.py [--hours 8] [--repeat 3] [--python PYTHON] [--no-obsea] [--no-day] [--no-experiments]
 
-Waveforms are simulated. Whole processes are timed from outside; `obsea`'s figure is the sum of its stages (azimuth, clutter,
+Waveforms are simulated. Whole processes are timed from outside, those of obsnet by the interpreter PYTHON: in an environment
+that holds its base install they do not load what only others need (xarray loads dask wherever it is). `obsea`'s figure is the sum of its stages (azimuth, clutter,
 range, track) in a process of its own on the same record, run after obsnet's and on an otherwise idle machine.
 """
 
@@ -22,9 +23,9 @@ from pathlib import Path
 HERE = Path(__file__).parent
 
 
-def timed(command: list[str], repeat: int) -> tuple[float, float]:
-    """Median wall seconds and greatest resident megabytes of a command, after one run that is not counted."""
-    walls, peaks = [], []
+def timed(command: list[str], repeat: int) -> tuple[float, float, float]:
+    """Median wall and processor seconds and greatest resident megabytes of a command, after one run that is not counted."""
+    walls, processor, peaks = [], [], []
     for number in range(repeat + 1):
         clock = time.perf_counter()
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -33,16 +34,17 @@ def timed(command: list[str], repeat: int) -> tuple[float, float]:
             raise SystemExit(f"{' '.join(command)} failed")
         if number:
             walls.append(time.perf_counter() - clock)
+            processor.append(usage.ru_utime + usage.ru_stime)
             peaks.append(usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2))
-    return statistics.median(walls), max(peaks)
+    return statistics.median(walls), statistics.median(processor), max(peaks)
 
 
-def import_ratio(repeat: int = 15) -> float:
+def import_ratio(python: str, repeat: int = 15) -> float:
     """Median time of `import obsnet` over that of `import numpy`, in processes of their own."""
 
     def measure(module: str) -> float:
         code = f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"
-        times = [float(subprocess.check_output([sys.executable, "-c", code])) for _ in range(repeat)]
+        times = [float(subprocess.check_output([python, "-c", code])) for _ in range(repeat)]
         return statistics.median(times)
 
     return measure("obsnet") / measure("numpy")
@@ -65,8 +67,8 @@ def record(folder: Path, hours: float) -> None:
     subprocess.run(command, check=True)
 
 
-def track(folder: Path, repeat: int) -> tuple[float, float]:
-    command = [sys.executable, "-m", "obsnet", "track", str(folder / "waveforms.mseed"), "--station", str(folder / "station.xml"),
+def track(python: str, folder: Path, repeat: int) -> tuple[float, float, float]:
+    command = [python, "-m", "obsnet", "track", str(folder / "waveforms.mseed"), "--station", str(folder / "station.xml"),
                "--out", str(folder / "out"), "--quiet"]  # fmt: skip
     return timed(command, repeat)
 
@@ -91,6 +93,7 @@ def main() -> None:
     )
     parser.add_argument("--hours", type=float, default=8.0)
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--no-obsea", action="store_true")
     parser.add_argument("--no-day", action="store_true")
     parser.add_argument("--no-experiments", action="store_true")
@@ -98,14 +101,15 @@ def main() -> None:
     print(
         f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, simulated waveforms, four channels at 50 Hz"
     )
-    print(f"import obsnet / import numpy: {import_ratio():.1f}")
+    print(f"import obsnet / import numpy: {import_ratio(arguments.python):.1f}")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "short"
         record(folder, arguments.hours)
-        wall, peak = track(folder, arguments.repeat)
+        wall, processor, peak = track(arguments.python, folder, arguments.repeat)
         stages = json.loads((folder / "out" / "run.json").read_text())["seconds"]
         print(
-            f"obsnet track, whole process, {arguments.hours:g} h: {wall:.2f} s, {peak:.0f} MB; stages {stages}"
+            f"obsnet track, whole process, {arguments.hours:g} h: {wall:.2f} s ({processor:.2f} s on the processors), "
+            f"{peak:.0f} MB; stages {stages}"
         )
         if not arguments.no_obsea:
             command = [
@@ -127,8 +131,10 @@ def main() -> None:
         if not arguments.no_day:
             day = Path(temporary) / "day"
             record(day, 24.0)
-            wall, peak = track(day, max(arguments.repeat - 2, 1))
-            print(f"obsnet track, a station-day: {wall:.2f} s, {peak:.0f} MB")
+            wall, processor, peak = track(arguments.python, day, max(arguments.repeat - 2, 1))
+            print(
+                f"obsnet track, a station-day: {wall:.2f} s ({processor:.2f} s on the processors), {peak:.0f} MB"
+            )
         if not arguments.no_experiments:
             experiments(Path(temporary))
 
