@@ -54,18 +54,20 @@ def track(
     )  # fmt: skip
     reference = read_reference(ais, station) if ais else None
     with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
+        bar = stack.enter_context(ExitStack())
+        progress = bar.enter_context(console.progress("reading and detecting", quiet))
         report: list[Beside] = []
 
         def draw(heard: Run) -> None:
+            bar.close()  # its thread would keep the process from being copied
             task = heard.drawing(folder / "report.png", reference)
             report.append(stack.enter_context(Beside(task, jobs)))
 
-        with console.progress("reading and detecting", quiet) as progress:
-            task = runs.track if tracking else runs.detect
-            run = task(
-                waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-                progress=progress, amplitudes=amplitudes, heard=draw,
-            )  # fmt: skip
+        task = runs.track if tracking else runs.detect
+        run = task(
+            waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
+            progress=progress, amplitudes=amplitudes, heard=draw,
+        )  # fmt: skip
         report[0].tell((run.segments, run.tracks, run.info))
         runs.write_tables(run, folder)
         report[0].finish()
