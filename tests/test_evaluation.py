@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,7 @@ from obsnet.config import to_dict
 from obsnet.errors import ConfigError, LayoutError
 from obsnet.evaluation import DetectionCriteria, MatchGates, evaluate, evaluate_folder, match_tracks
 from obsnet.evaluation.detections import smad
-from obsnet.kinematics import StraightCourse, wrap180
+from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.layout import from_posix, iso
 
 T0 = 1369130400.0
@@ -383,3 +384,18 @@ def test_bad_parameters_and_tables():
         evaluate(detections().drop(columns="range_m"), tracks(), [])
     with pytest.raises(LayoutError, match="the tracks lack speed_mps"):
         evaluate(detections(), tracks(FIRST).drop(columns="speed_mps"), [])
+
+
+def test_a_ship_that_turns_is_scored_against_its_course_at_cpa():
+    """The line through all AIS of a ship that turned an hour after CPA is nowhere its course; both are told."""
+    turning = BentCourse(T0, 10e3, 60.0, 7.0, turn_s=3600.0, turn_deg=40.0)
+    reference = replace(
+        ship(FIRST), east_m=(place := turning.position(ship(FIRST).time))[0], north_m=place[1]
+    )
+    result = evaluate(detections(), tracks(FIRST), [reference], delay)
+    (row,) = result.ships
+    assert row.track == 1
+    assert abs(row.cpa_time_error_s) < 1.0 and abs(row.cpa_distance_error_m) < 1.0
+    assert abs(row.course_error_deg) < 0.1 and abs(row.speed_error_mps) < 0.01
+    assert result.against_lines["course_error_deg"] > 10.0
+    assert "against straight lines" in result.table()

@@ -83,7 +83,11 @@ class Result:
         if self.detectors:
             lines += ["", "every detector on the same waveforms:", _detector_table(self.detectors)]
         if self.obsea is not None:
-            lines += ["", f"obsea 0.1 on the same waveforms ({self.obsea['command']}):", self.obsea["table"]]
+            lines += [
+                "",
+                f"obsea 0.1 on the same waveforms ({self.obsea['command']}; errors against straight lines):",
+                self.obsea["table"],
+            ]
         lines += ["", "The paper's Table I (real waveforms):", _paper_table()]
         return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""What a tracker says to the world: a ship's straight course past the station, and how sure that is."""
+"""What a tracker says to the world: a ship's course past the station, and how sure that is."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Track:
-    """Where a ship was: a straight course, its covariance, and the evidence for it.
+    """Where a ship was: its course (the tangent at CPA and, where it bends or turns, how), the covariance of that at CPA, and the evidence for it.
 
     Attributes
     ----------
