@@ -34,7 +34,9 @@ MOST_TURN_DEG = 100.0
 """Prior odds of a turn within the hours of a passage, and its largest angle; when and by how much are uniform."""
 
 WORTH = 20.0
-"""A turn is looked into where it alone gains this much on the straight course, in nats."""
+ANOTHERS = 60.0
+"""A turn is looked into where it alone gains so many nats on the straight course, and believed where it then gains as many as a
+further ship must (`GridSearchConfig.min_log_bayes_factor_next`): what it explains may be another's."""
 
 TERMS = 2
 BENDS = slice(4, 4 + 4 * TERMS)
@@ -99,7 +101,8 @@ def bends(
         known, effective = _sampled(
             turned, straight.covariance, log_likelihood, allowed, reach_s, samples, seed
         )
-        models.append((known, np.log(TURN_ODDS), effective))
+        if known.log_evidence - straight.log_evidence > ANOTHERS:
+            models.append((known, np.log(TURN_ODDS), effective))
     trusted = [model.log_evidence if count >= UNTRUSTED else -np.inf for model, _, count in models]
     trusted[0] += ASKED
     best = int(np.argmax(trusted))
