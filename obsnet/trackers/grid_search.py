@@ -95,6 +95,9 @@ MEDIUM = _Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
 TURN_DEG = 30.0
 """How far from a known ship's azimuth sound may still be that ship's."""
 
+LINGERS = 1.25
+"""How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
+
 RANGED = 4.0
 """Range log-likelihood ratio from which a tile has heard a known ship's range."""
 
@@ -134,7 +137,8 @@ def search(
     times, azimuth_llr, range_llr = read
     finder = _Finder(maps, times, delay, config, threads)
     for track in known:
-        azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr)
+        # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.
+        azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr, finder.heard_m(track))
     tracks: list[Track] = []
     # Without azimuths nothing tells a second ship from the first one's ghost ranges.
     for number in range(config.max_ships if "azimuth_llr" in maps else 1):
@@ -371,6 +375,10 @@ class _Finder:
             & (points[:, 0] <= self.tiles[-1] + 1800.0)
         )
 
+    def heard_m(self, track: Track) -> float:
+        """Distance [m] up to which a track may be heard, by where it was."""
+        return LINGERS * float(track.motion.observables(np.array([track.start, track.end]))[1].max())
+
     def _score_maps(
         self,
         azimuth_llr: np.ndarray | None,
@@ -399,14 +407,19 @@ class _Finder:
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
 
     def without(
-        self, track: Track, azimuth_llr: np.ndarray | None, range_llr: np.ndarray | None
+        self,
+        track: Track,
+        azimuth_llr: np.ndarray | None,
+        range_llr: np.ndarray | None,
+        reach_m: float = np.inf,
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """The maps with what a track explains made silent, for the search of the next ship."""
+        """The maps with what a track explains made silent, for the search of the next ship; beyond `reach_m` it explains nothing."""
         emitted = self.origin + self.tiles
         for _ in range(3):
             _, distance, _ = track.motion.observables(emitted)
             emitted = self.origin + self.tiles - self.delay(distance)
         azimuth, distance, rate = track.motion.observables(emitted)
+        distance = np.where(distance <= reach_m, distance, np.nan)
         ranged = np.zeros(len(self.tiles), bool)
         if range_llr is not None:
             near = abs(self.range_m[None, :] - distance[:, None]) <= 3000.0
@@ -419,6 +432,7 @@ class _Finder:
             explained = lobe(azimuth_llr, self.azimuth, azimuth, TURN_DEG)
             beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= TURN_DEG
             explained |= beside & ranged[:, None]
+            explained &= np.isfinite(distance)[:, None]
             # Where one ship is loud, a ship anywhere may explain more than none: the next is held against the first.
             azimuth_llr = above_floor(
                 np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr), explained

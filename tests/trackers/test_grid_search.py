@@ -8,7 +8,7 @@ from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
 from obsnet.trackers.grid_search import GridSearchConfig, search
 from obsnet.trackers.score_maps import lobe
-from obsnet.trackers.track import Segment
+from obsnet.trackers.track import Segment, Track
 
 T0 = 1_369_123_200.0
 AZIMUTH = np.arange(0.0, 360.0)
@@ -117,6 +117,18 @@ def test_a_further_ship_may_pass_hours_from_the_segments_turn():
     tracks = search(maps_of(ships, MINUTES, np.random.default_rng(7)), segment, delay)
     assert len(tracks) == 2
     assert min(abs(t.motion.cpa_time - ships[1].cpa_time) for t in tracks) < 60.0
+
+
+def test_the_next_ship_on_the_lane_is_not_taken_for_the_one_long_gone():
+    """Both go to the same azimuth; only the first explains what was heard before it was out of earshot."""
+    gone = StraightCourse(T0 - 6 * 3600.0, 15_000.0, 60.0, 7.0)
+    known = Track(
+        gone.cpa_time - 9000.0, gone.cpa_time + 9000.0, gone, np.diag([30.0, 200.0, 1.0, 0.1]) ** 2, 500.0
+    )
+    coming = StraightCourse(T0 + 5000.0, 4_000.0, 60.0, 8.0)
+    (found,) = search(maps_of([coming], MINUTES, np.random.default_rng(4)), SEGMENT, delay, known=[known])
+    assert abs(found.motion.cpa_time - coming.cpa_time) < 60.0
+    assert found.end - found.start > 200 * 60.0
 
 
 def test_lobe_of_a_ship_ends_where_anothers_begins():
