@@ -41,7 +41,10 @@ Code = Annotated[
     str | None, typer.Option("--code", help="NET.STA, where the StationXML holds several stations.")
 ]
 Out = Annotated[Path, typer.Option("--out", help="Output folder.", parser=_folder)]
-DetectorName = Annotated[str | None, typer.Option("--detector", help="learned or analytic.")]
+DetectorName = Annotated[
+    str | None,
+    typer.Option("--detector", help="learned-azimuth (default), analytic, learned-range or learned."),
+]
 TrackerName = Annotated[str | None, typer.Option("--tracker", help="grid, bernoulli or focalization.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of parameters.")]
 Overrides = Annotated[
@@ -416,7 +419,11 @@ def reproduce(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the figure.")] = None,
     detector: Annotated[
-        str | None, typer.Option("--detector", help="Of table1: learned, analytic or all.")
+        str | None,
+        typer.Option(
+            "--detector",
+            help="Of table1: learned-azimuth (default), analytic, learned-range, learned or all.",
+        ),
     ] = None,
     jobs: Jobs = None,
     quiet: Quiet = False,

@@ -63,7 +63,7 @@ class RunConfig:
     `detector` may also be learned in azimuth or in range alone, for comparisons.
     """
 
-    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] = "analytic"
+    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] = "learned-azimuth"
     tracker: Literal["grid", "bernoulli", "focalization"] = "grid"
     spectra: SpectraConfig = field(default_factory=SpectraConfig)
     azigram: AzigramConfig = field(default_factory=AzigramConfig)

@@ -118,7 +118,7 @@ def track(
     station: Station,
     config: RunConfig | None = None,
     *,
-    detector: Literal["learned", "analytic"] | None = None,
+    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] | None = None,
     **options: Any,
 ) -> Run:
     """Waveforms to tracks.
@@ -128,7 +128,7 @@ def track(
     stream : obspy Stream, or path(s) of files, folders or an SDS archive.
     station : Station, for instance from `Station.from_stationxml`.
     config : RunConfig, defaults of the core paper.
-    detector : 'learned' or 'analytic'; overrides `config.detector`.
+    detector : overrides `config.detector`.
     starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
     amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
     folder : write maps and features there block by block, so that memory stays flat with record length.

@@ -25,16 +25,18 @@ def stored(state):
     }
 
 
-def test_going_on_from_a_state_changes_nothing(blocks):
+@pytest.mark.parametrize("detector", ["analytic", "learned"])
+def test_going_on_from_a_state_changes_nothing(blocks, detector):
     station, spectra = blocks
-    whole, current = (Pipeline(station, RunConfig(), threads=1) for _ in range(2))
+    config = RunConfig(detector=detector)
+    whole, current = (Pipeline(station, config, threads=1) for _ in range(2))
     expected = [minutes for block in spectra for minutes in whole.push(block)]
     got = []
     for number, block in enumerate(spectra):
         if number in (0, 1, 2, 20):
             state, current = (
                 stored(current.state()),
-                Pipeline(station, RunConfig(), table=whole.table, threads=1),
+                Pipeline(station, config, table=whole.table, threads=1),
             )
             current.restore(state)
         got += current.push(block)
@@ -56,7 +58,7 @@ def test_what_is_complete_stays_the_same_object(blocks):
     after = pipeline.state()
     kept = [name for name in after if after[name] is before.get(name)]
     assert any(name.startswith("clutter/frames/") for name in kept)
-    assert any(name.startswith("background/sum/") for name in kept)
+    assert any("background/sum/" in name for name in kept)
 
 
 def test_a_tracker_without_a_state_is_refused(blocks):

@@ -122,7 +122,7 @@ def test_run_json_says_how(finished):
         "waveforms",
     } <= info.keys()
     assert info["station"]["code"] == "XX.SIM01"
-    assert info["config"]["detector"] == "analytic"
+    assert info["config"]["detector"] == "learned-azimuth"
     assert info["seconds"].keys() >= {"spectra", "detect", "track"}
     assert info["tracks"] == 1
     assert UTC.fullmatch(info["start"])

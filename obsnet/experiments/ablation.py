@@ -7,6 +7,7 @@ validation records, which have other seeds than the test records.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import time
@@ -50,10 +51,10 @@ class Row:
 
 
 BASES: dict[str, RunConfig] = {
-    "analytic": RunConfig(),
-    "mean_cepstrum": RunConfig(cepstrogram=CepstrogramConfig(clutter="mean")),
-    "uniform_null": RunConfig(azimuth=AzimuthDetectorConfig(null="uniform")),
-    "table_ii": RunConfig(),
+    "analytic": RunConfig(detector="analytic"),
+    "mean_cepstrum": RunConfig(detector="analytic", cepstrogram=CepstrogramConfig(clutter="mean")),
+    "uniform_null": RunConfig(detector="analytic", azimuth=AzimuthDetectorConfig(null="uniform")),
+    "table_ii": RunConfig(detector="analytic"),
     "learned_azimuth": RunConfig(detector="learned-azimuth"),
     "learned_range": RunConfig(detector="learned-range"),
     "learned": RunConfig(detector="learned"),
@@ -223,8 +224,15 @@ def recalibration(folder: str | Path) -> dict[str, tuple[float, float]]:
     -------
     dict of (slope, offset): the recalibrated ratio is slope·llr + offset.
     """
+    return _recalibration(
+        tuple((path, path.stat().st_mtime_ns) for path in sorted(Path(folder).glob(f"*/*/{SAMPLES}")))
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def _recalibration(samples: tuple[tuple[Path, int], ...]) -> dict[str, tuple[float, float]]:
     losses: dict[str, list[Callable[[float, float], np.ndarray]]] = {"azimuth": [], "range": []}
-    for path in sorted(Path(folder).glob(f"*/*/{SAMPLES}")):
+    for path, _ in samples:
         with np.load(path) as held:
             if "azimuth_llr" in held.files:
                 losses["azimuth"].append(_azimuth_loss(held["azimuth_llr"], held["azimuth_holds"]))
