@@ -95,7 +95,7 @@ MEDIUM = _Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
 TURN_DEG = 30.0
 """How far from a known ship's azimuth sound may still be that ship's."""
 
-LINGERS = 1.25
+LINGERS = 2.0
 """How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
 
 RANGED = 4.0
