@@ -200,9 +200,9 @@ def draw(scores: pd.DataFrame, path: str | Path) -> None:
             if limits is not None:
                 axes.set_ylim(*limits)
             axes.tick_params(labelsize=7)
-            if row == column == 0:
-                axes.legend(fontsize=6, ncols=2, loc="upper right", framealpha=0.9)
-    made.tight_layout()
+    made.tight_layout(rect=(0.0, 0.03, 1.0, 1.0))
+    handles, labels = made.axes[0].get_legend_handles_labels()
+    made.legend(handles, labels, fontsize=8, ncols=len(labels), loc="lower center", frameon=False)
     made.savefig(path)
 
 
