@@ -150,8 +150,3 @@ def wrap180(angle_deg: np.ndarray | float) -> np.ndarray:
     -10.0
     """
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
-
-
-def heard_time(emitted: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
-    """Time at which the station hears what left the ship at `emitted`, `delay_s` the path's travel time there."""
-    return np.asarray(emitted) + np.asarray(delay_s)
