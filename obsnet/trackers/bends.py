@@ -34,9 +34,7 @@ MOST_TURN_DEG = 100.0
 """Prior odds of a turn within the hours of a passage, and its largest angle; when and by how much are uniform."""
 
 WORTH = 20.0
-ANOTHERS = 60.0
-"""A turn is looked into where it alone gains so many nats on the straight course, and believed where it then gains as many as a
-further ship must (`GridSearchConfig.min_log_bayes_factor_next`): what it explains may be another's."""
+"""A turn is looked into where it alone gains so many nats on the straight course."""
 
 TERMS = 2
 BENDS = slice(4, 4 + 4 * TERMS)
@@ -81,6 +79,7 @@ def bends(
     allowed: Callable[[np.ndarray], np.ndarray],
     reach_s: np.ndarray,
     *,
+    least_of_turn: float,
     samples: int = 3000,
     seed: int = 0,
 ) -> Bends:
@@ -91,6 +90,7 @@ def bends(
     straight : posterior of the straight course.
     allowed : points to whether the prior of the course at CPA, uniform, allows them (n).
     reach_s : (2), s before and after CPA over which the velocity departs.
+    least_of_turn : nats that a turn must gain to be believed.
     """
     start = np.concatenate([straight.mean, np.zeros(TURN.stop - 4)])
     models = [(Posterior(start, straight.covariance, straight.log_evidence), np.log(STRAIGHT_ODDS), np.inf)]
@@ -101,7 +101,7 @@ def bends(
         known, effective = _sampled(
             turned, straight.covariance, log_likelihood, allowed, reach_s, samples, seed
         )
-        if known.log_evidence - straight.log_evidence > ANOTHERS:
+        if known.log_evidence - straight.log_evidence > least_of_turn:
             models.append((known, np.log(TURN_ODDS), effective))
     trusted = [model.log_evidence if count >= UNTRUSTED else -np.inf for model, _, count in models]
     trusted[0] += ASKED

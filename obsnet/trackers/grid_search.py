@@ -304,7 +304,11 @@ class _Finder:
             return self.config.exponent * total, self.config.exponent * per_tile
 
         config = self.config
-        found = bends(straight, log_likelihood, self._inside, reach, samples=config.samples, seed=config.seed)
+        # What a turn explains may be another ship's: it must gain as much as a further ship.
+        found = bends(
+            straight, log_likelihood, self._inside, reach, least_of_turn=config.min_log_bayes_factor_next,
+            samples=config.samples, seed=config.seed,
+        )  # fmt: skip
         mean = found.mean
         changes: dict[str, Any] = {"covariance": self._of_table(found.covariance, mean)}
         if found.bent:

@@ -82,7 +82,7 @@ def found(rng, ship):
     allowed = lambda points: np.ones(len(points), bool)  # noqa: E731
     state = np.array(ship.state)
     straight = posterior(state, log_likelihood, allowed, np.ones(4, bool), samples=600)
-    known = bends(straight, log_likelihood, allowed, REACH, samples=1200)
+    known = bends(straight, log_likelihood, allowed, REACH, least_of_turn=60.0, samples=1200)
     mean = known.mean[:4] if known.bent else straight.mean
     errors = [straight.mean - state, mean - state]
     for error in errors:
