@@ -1,5 +1,7 @@
 """SDS archives of simulated waveforms, and parameters that are quick."""
 
+import os
+
 import obspy
 import pytest
 
@@ -69,3 +71,12 @@ def command(obsnet, record):
         )  # fmt: skip
 
     return run
+
+
+@pytest.fixture(autouse=True)
+def same_environment():
+    """Dask sets the threads of BLAS for its workers in this process, whose other children would then round otherwise."""
+    kept = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(kept)
