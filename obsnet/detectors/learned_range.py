@@ -26,7 +26,7 @@ from obsnet.errors import ConfigError, ModelError
 from obsnet.layout import to_posix
 from obsnet.signals.spectra import SpectraConfig
 
-BATCH = 4096
+BATCH = 1024
 CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 END_SLOPE = 0.1
@@ -155,12 +155,8 @@ class LearnedRangeDetector:
         """
         config, grid = self.config, self._front.config
         coarse = self.ratios(cepstrogram, minutes)
-        llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
-        kernels.resample(
-            coarse,
-            *_weights(config.range_m, grid.range_m),
-            *_weights(config.range_rate, grid.range_rate),
-            llr,
+        llr = kernels.resample(
+            coarse, *_weights(config.range_m, grid.range_m), *_weights(config.range_rate, grid.range_rate)
         )
         if self._shape is not None:
             fine = self._shape.maps(cepstrogram, minutes)["range_llr"].values
@@ -168,7 +164,7 @@ class LearnedRangeDetector:
                 round(SHAPE_REACH_M / config.range_step_m),
                 round(SHAPE_REACH_MPS / _step(config.range_rate)),
             )
-            kernels.share_out(llr, fine, np.float32(SHAPE_SLOPE), *reach)
+            kernels.share_out(llr, fine, SHAPE_SLOPE, *reach)
         times = to_posix(cepstrogram["time"].values)
         start, stop = window_bounds(times, minutes, config.window_s)
         covered = coverage(

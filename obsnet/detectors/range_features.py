@@ -91,6 +91,14 @@ class DelayTable:
     propagation : Dataset of `obsnet.ocean.rays.propagation`.
     config : RangeFeaturesConfig
     quefrency_step_s, n_quefrency : of the oversampled cepstrum.
+
+    Attributes
+    ----------
+    index, seconds, slope, phase, strength, exists : (n_fine, n_pairs) at ranges (i − pad)·`FINE_M`: quefrency index, n_quefrency
+        where a pair does not exist; delay [s], its derivative [s/m], phasor against the pulse, log strength.
+    inverse : (n_pairs, n_quefrency + 1) range of the grid, as an index, at which a pair has a delay, −1 where none.
+    there, drift : (n_fine, n_pairs p, n_pairs q) range of the grid at which pair q has p's delay, and the range rate there over
+        p's, NaN where q has not or is p.
     """
 
     def __init__(
@@ -104,7 +112,7 @@ class DelayTable:
         fine = (np.arange(int(config.max_range_m / FINE_M) + 1 + 2 * self.pad) - self.pad) * FINE_M
         table = interpolate(propagation, np.abs(fine))
         numbers = table["path"].values.tolist()
-        shape = (len(config.pairs), fine.size)
+        shape = (fine.size, len(config.pairs))
         seconds, phase, self.strength = (
             np.full(shape, np.nan),
             np.ones(shape, np.complex64),
@@ -115,19 +123,30 @@ class DelayTable:
             first, second = parse_pair(pair)
             if first in numbers and second in numbers:
                 one, two = table.sel(path=first), table.sel(path=second)
-                seconds[p] = two["delay"].values - one["delay"].values
+                seconds[:, p] = two["delay"].values - one["delay"].values
                 both = loudness[numbers.index(first)] * loudness[numbers.index(second)]
-                self.strength[p] = np.log(np.maximum(2.0 * both, np.exp(FAINTEST)))
-                phase[p] = np.exp(1j * np.angle(one["pressure"].values * two["pressure"].values.conj()))
+                self.strength[:, p] = np.log(np.maximum(2.0 * both, np.exp(FAINTEST)))
+                phase[:, p] = np.exp(1j * np.angle(one["pressure"].values * two["pressure"].values.conj()))
         reach = config.lag_step_s * (config.lags // 2)
         longest = (n_quefrency - 1) * quefrency_step_s - reach
-        exists = (seconds >= max(config.shortest_delay_s, reach)) & (seconds <= longest)
+        self.exists = (seconds >= max(config.shortest_delay_s, reach)) & (seconds <= longest)
         self.phase = np.where(np.isfinite(phase), phase, 1.0).astype(np.complex64)
-        self.index = np.where(exists, np.rint(np.nan_to_num(seconds) / quefrency_step_s), n_quefrency)
+        self.index = np.where(self.exists, np.rint(np.nan_to_num(seconds) / quefrency_step_s), n_quefrency)
         self.index = self.index.astype(np.int32)
-        self.seconds = np.where(exists, seconds, 1.0)
-        self.slope = np.where(exists, np.nan_to_num(np.gradient(seconds, FINE_M, axis=1)), 0.0)
-        self.inverse = _inverse(seconds, exists, fine, config, quefrency_step_s, n_quefrency)
+        self.seconds = np.where(self.exists, seconds, 1.0)
+        self.slope = np.where(self.exists, np.nan_to_num(np.gradient(seconds, FINE_M, axis=0)), 0.0)
+        self.inverse = _inverse(seconds.T, self.exists.T, fine, config, quefrency_step_s, n_quefrency)
+        self.there, self.drift = self._others(config)
+
+    def _others(self, config: RangeFeaturesConfig) -> tuple[np.ndarray, np.ndarray]:
+        there = np.moveaxis(self.inverse[:, self.index], 0, -1)
+        pair = np.arange(len(config.pairs))
+        found = np.maximum(there, 0)
+        place = self.pad + found * round(config.range_step_m / FINE_M)
+        slope = self.slope[place, pair]
+        known = (there >= 0) & (slope != 0.0) & (pair[:, None] != pair)
+        drift = np.divide(self.slope[:, :, None], slope, out=np.full(slope.shape, np.nan), where=known)
+        return found, drift
 
 
 @dataclass(frozen=True)
@@ -189,14 +208,11 @@ class RangeFeatures:
         valid = ~np.isnan(frames[:, 0])
         analytic = analytic_cepstrum(frames, quefrency, nfft, config.band_hz)
         start, stop = window_bounds(times, minutes, config.window_s)
-        shape = (len(minutes), len(config.pairs), len(config.range_rate), len(config.range_m))
-        energy = np.empty(shape, np.float32)
-        kernels.pair_energy(
-            analytic, valid, times, start, stop, minutes, table.index, table.pad, FINE_M,
-            round(config.range_step_m / FINE_M), config.range_rate, energy,
+        energy = kernels.pair_energy(
+            analytic, valid, times, start, stop, minutes, table.index.T, table.pad, FINE_M,
+            round(config.range_step_m / FINE_M), config.range_rate, len(config.range_m),
         )  # fmt: skip
-        score = np.empty((shape[0], *shape[2:]), np.float32)
-        kernels.cheap_score(energy, score)
+        score = kernels.cheap_score(energy)
         once = _once(analytic, valid, times, start, stop, minutes, energy, config)
         return Look(analytic, valid, times, start, stop, minutes, energy, score, once)
 
@@ -227,15 +243,81 @@ class RangeFeatures:
         `GLOBALS`.
         """
         config, table = self.config, self.table
-        found = np.empty((len(range_m), config.size), np.float32)
-        kernels.describe(
-            look.analytic, look.valid, look.frame_time, look.start, look.stop, look.minutes, look.energy, look.score,
-            look.once, np.ascontiguousarray(index, np.int64), np.ascontiguousarray(range_m, float),
-            np.ascontiguousarray(rate, float), table.index, table.seconds, table.strength, table.slope, table.phase, table.inverse,
-            table.pad, FINE_M, config.range_step_m, config.range_rate, self._lag_step,
-            config.window_s / config.sub_windows, config.sub_windows, config.lags, table.depth_m, found,
-        )  # fmt: skip
+        index, range_m, rate = np.asarray(index), np.asarray(range_m, float), np.asarray(rate, float)
+        centre = table.pad + np.rint(range_m / FINE_M).astype(np.int64)
+        exists = table.exists[centre]
+        sums = np.empty((len(index), *config.patch_shape[:3]), np.complex64)
+        count = np.empty((len(index), config.sub_windows), np.float32)
+        order = np.argsort(index, kind="stable")
+        windows, first = np.unique(index[order], return_index=True)
+        for window, rows in zip(windows, np.split(order, first[1:]), strict=True):
+            sums[rows], count[rows] = self._stacked(look, window, range_m[rows], rate[rows])
+        total = sums[..., config.lags // 2].sum(axis=2)
+        sums *= np.where(exists, table.phase[centre], 0.0)[:, :, None, None]
+        sums /= np.sqrt(np.maximum(count, 1.0))[:, None, :, None]
+        found = np.empty((len(index), config.size), np.float32)
+        said = int(np.prod(config.patch_shape))
+        found[:, :said] = sums.view(np.float32).reshape(len(index), -1)
+        slope = table.slope[centre]
+        context = np.stack(
+            [
+                np.ones_like(slope),
+                np.log1p((total.real**2 + total.imag**2) / np.maximum(count.sum(axis=1), 1.0)[:, None]),
+                np.log1p(self._ghosts(look, index, centre, rate)),
+                1e4 * slope,
+                np.log(table.seconds[centre]),
+                np.abs(1e3 * slope * rate[:, None]),
+                table.strength[centre],
+            ],
+            axis=-1,
+        )
+        found[:, said : -len(GLOBALS)] = np.where(exists[..., None], context, 0.0).reshape(len(index), -1)
+        found[:, -len(GLOBALS)] = range_m / table.depth_m
+        found[:, 1 - len(GLOBALS) :] = look.once[index]
         return found
+
+    def _stacked(
+        self, look: Look, window: int, range_m: np.ndarray, rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Cepstra around the delays of one window's hypotheses, (n, pair, sub-window, lag), and frames of its sub-windows."""
+        config, table = self.config, self.table
+        frame = slice(look.start[window], look.stop[window])
+        later = look.frame_time[frame] - look.minutes[window]
+        sub = _sub_window(later, config)
+        place = table.pad + np.rint((range_m + rate * later[:, None]) / FINE_M).astype(np.int64)
+        sums = kernels.patches(
+            look.analytic[frame], sub, table.index[place], self._lag_step, config.sub_windows, config.lags
+        )
+        return sums, np.bincount(sub, look.valid[frame], config.sub_windows)
+
+    def _ghosts(self, look: Look, index: np.ndarray, centre: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Cheap score that other pairs give to the ranges at which another pair q has pair p's delay, the largest over q.
+
+        A ridge at pair p's delay may be pair q's, of a ship at another range; that ship's other pairs then show elsewhere.
+        q's own share of the score there is left out. (n, pair) float32.
+        """
+        config, table = self.config, self.table
+        rates = config.range_rate
+        windows, row = np.unique(index, return_inverse=True)
+        others = kernels.best_of_others(look.energy[windows], look.score[windows])
+        drift = table.drift[centre]
+        drift *= rate[:, None, None] / (rates[1] - rates[0])
+        drift -= rates[0] / (rates[1] - rates[0])
+        number = np.rint(drift, out=drift)
+        known = (number >= 0) & (number < len(rates))  # False for NaN
+        pair = np.arange(len(config.pairs))
+        ravelled = np.where(known, number, 0.0).astype(np.int64)
+        ravelled += len(rates) * (pair + len(pair) * row[:, None, None])
+        ravelled *= len(config.range_m)
+        ravelled += table.there[centre]
+        return np.where(known, others.ravel()[ravelled], np.float32(0.0)).max(axis=2)
+
+
+def _sub_window(later: np.ndarray, config: RangeFeaturesConfig) -> np.ndarray:
+    """Sub-window of frames so much later than the window's minute."""
+    length = config.window_s / config.sub_windows
+    number = np.floor(later / length + 0.5 * config.sub_windows).astype(np.int64)
+    return np.clip(number, 0, config.sub_windows - 1)
 
 
 def _once(
@@ -255,7 +337,7 @@ def _once(
     power = np.where(valid, (thinned.real**2 + thinned.imag**2).mean(axis=1), 0.0)
     out = np.zeros((len(minutes), n_sub + 2), np.float32)
     for w, (lo, hi) in enumerate(zip(start, stop, strict=True)):
-        sub = np.clip(np.floor((times[lo:hi] - minutes[w]) / length + 0.5 * n_sub).astype(int), 0, n_sub - 1)
+        sub = _sub_window(times[lo:hi] - minutes[w], config)
         out[w, :n_sub] = np.minimum(np.bincount(sub, valid[lo:hi], n_sub) * hop_s / length, 1.0)
         out[w, n_sub] = np.log(max(power[lo:hi].sum() / max(valid[lo:hi].sum(), 1), 1e-3))
     still = energy[:, :, energy.shape[2] // 2]
@@ -285,12 +367,11 @@ def analytic_cepstrum(
     weight = np.interp(frequency, band_hz, (0.0, 1.0, 1.0, 0.0))
     size = 2 * (n - 1)
     gain = weight / np.sqrt(2.0 * np.sum(weight**2) / (n - 1)) * 2.0 / size
-    padded = np.zeros((len(frames), OVERSAMPLING * size), np.complex64)
-    padded[:, :n] = spectrum * gain.astype(np.float32)
-    values = scipy.fft.ifft(padded, axis=1, overwrite_x=True, norm="forward")
+    spectrum *= gain.astype(np.float32)
     out = np.zeros((len(frames), OVERSAMPLING * (n - 1) + 2), np.complex64)
-    out[:, :-1] = values[:, : out.shape[1] - 1]
-    return out
+    # Of a real spectrum, the transform forward is the one backward conjugated.
+    out[:, :-1] = scipy.fft.rfft(spectrum, OVERSAMPLING * size, axis=1)
+    return np.conjugate(out, out=out)
 
 
 def _loudness(table: xr.Dataset) -> np.ndarray:

@@ -1,158 +1,146 @@
-"""The loops of the learned range detector, compiled: cepstra gathered along the delays of hypotheses."""
+"""The arithmetic of the learned range detector: cepstra gathered along the delays of hypotheses."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
-from numba import njit
+from numpy.lib.stride_tricks import sliding_window_view
 
 HINGE_SLOPE, HINGE_ONSET, HINGE_TOP = 0.8, 1.8, 60.0
 """A pair's share of the cheap score: a line in its energy from an onset, which noise seldom reaches, to a top."""
 
+_WINDOWS = 4
+"""Windows gathered at once: what fits a core's cache."""
+_LOWEST = -80.0
+"""Least log of what is summed, relative to the largest: its exponential is still a normal float32."""
 
-@njit(cache=True, nogil=True)
-def pair_energy(analytic, valid, frame_time, start, stop, minutes, delay, pad, fine_m, stride, rates, energy):
+
+def pair_energy(
+    analytic: np.ndarray,
+    valid: np.ndarray,
+    frame_time: np.ndarray,
+    start: np.ndarray,
+    stop: np.ndarray,
+    minutes: np.ndarray,
+    delay: np.ndarray,
+    pad: int,
+    fine_m: float,
+    stride: int,
+    rates: np.ndarray,
+    n_range: int,
+) -> np.ndarray:
     """Energy of the coherent stack of a window's frames along each hypothesis, for every path pair.
 
+    Every frame is laid out over the fine ranges once, those that are `stride` apart side by side, so that a frame's part
+    of a stack is a stretch of memory.
+
     Parameters
     ----------
-    analytic : (n_frames, n_quefrency + 1) complex64 analytic cepstrum of unit noise variance; the last column is zero.
+    analytic : (n_frames, n_quefrency + 1) complex64 analytic cepstrum of unit noise variance, zero in frames that are not
+        `valid`; the last column is zero.
     valid : (n_frames) bool. frame_time, minutes : s. start, stop : (n_windows) frames of each window.
-    delay : (n_pairs, n_fine) int32 quefrency index of a pair at ranges (i − pad)·fine_m; the last column where none.
+    delay : (n_pairs, n_fine) quefrency index of a pair at ranges (i − pad)·fine_m; the last column where none.
     stride : fine steps from one range to the next. rates : (n_rates) m/s.
-    energy : (n_windows, n_pairs, n_rates, n_range) float32, overwritten; exponential of mean 1 in noise.
+
+    Returns
+    -------
+    (n_windows, n_pairs, n_rates, n_range) float32; exponential of mean 1 in noise.
     """
-    n_range = energy.shape[3]
-    sums = np.empty(n_range, np.complex64)
-    for w in range(energy.shape[0]):
-        for p in range(delay.shape[0]):
-            for k in range(rates.shape[0]):
-                sums[:] = 0.0
-                count = 0
-                for t in range(start[w], stop[w]):
-                    if not valid[t]:
-                        continue
-                    count += 1
-                    first = pad + int(np.rint(rates[k] * (frame_time[t] - minutes[w]) / fine_m))
-                    row = analytic[t]
-                    for i in range(n_range):
-                        sums[i] += row[delay[p, first + i * stride]]
-                scale = np.float32(1.0 / max(count, 1))
-                for i in range(n_range):
-                    energy[w, p, k, i] = scale * (sums[i].real ** 2 + sums[i].imag ** 2)
+    n_pairs, n_fine = delay.shape
+    width = -(-n_fine // stride)
+    laid = np.full((n_pairs, width * stride), analytic.shape[1] - 1, np.int64)
+    laid[:, :n_fine] = delay
+    laid = np.ascontiguousarray(laid.reshape(n_pairs, width, stride).transpose(2, 0, 1))
+    energy = np.empty((len(minutes), n_pairs, len(rates), n_range), np.float32)
+    before = np.concatenate([[0], np.cumsum(valid)])
+    for begin in range(0, len(minutes), _WINDOWS):
+        windows = range(begin, min(begin + _WINDOWS, len(minutes)))
+        first, last = int(start[windows].min()), int(stop[windows].max())
+        held = analytic[first:last].take(laid.ravel(), axis=1).reshape(-1, *laid.shape)
+        stretches = sliding_window_view(held, n_range, axis=3)
+        for w in windows:
+            later = frame_time[start[w] : stop[w]] - minutes[w]
+            place = pad + np.rint(rates[:, None] * later / fine_m).astype(np.int64)
+            row, count = np.arange(start[w], stop[w]) - first, before[stop[w]] - before[start[w]]
+            for k, (offset, phase) in enumerate(zip(place // stride, place % stride, strict=True)):
+                sums = stretches[row, phase, :, offset].sum(axis=0)
+                energy[w, :, k] = (sums.real**2 + sums.imag**2) * np.float32(1.0 / max(count, 1))
+    return energy
 
 
-@njit(cache=True, nogil=True)
-def cheap_score(energy, score):
-    """Sum over the pairs of a hinge of their energy: (n_windows, n_rates, n_range) float32, overwritten."""
-    for w in range(score.shape[0]):
-        score[w] = 0.0
-        for p in range(energy.shape[1]):
-            for k in range(score.shape[1]):
-                for i in range(score.shape[2]):
-                    score[w, k, i] += hinge(energy[w, p, k, i])
+def cheap_score(energy: np.ndarray) -> np.ndarray:
+    """Sum over the pairs of a hinge of their energy: (n_windows, n_rates, n_range) float32."""
+    return np.stack([hinge(window).sum(axis=0) for window in energy]) if len(energy) else energy[:, 0]
 
 
-@njit(cache=True, nogil=True, inline="always")
-def hinge(energy):
+def hinge(energy: np.ndarray) -> np.ndarray:
     """A pair's share of the cheap score at its energy."""
-    return np.float32(HINGE_SLOPE) * max(
-        min(energy, np.float32(HINGE_TOP)) - np.float32(HINGE_ONSET), np.float32(0.0)
-    )
+    share = np.clip(energy, np.float32(HINGE_ONSET), np.float32(HINGE_TOP))
+    share -= np.float32(HINGE_ONSET)
+    share *= np.float32(HINGE_SLOPE)
+    return share
 
 
-@njit(cache=True, nogil=True)
-def describe(
-    analytic, valid, frame_time, start, stop, minutes, energy, score, once, window, range_m, rate, index, seconds, strength,
-    slope, phase, inverse, pad, fine_m, coarse_m, rates, lag_step, sub_s, n_sub, n_lags, depth_m, out,
-):  # fmt: skip
-    """Feature vectors of hypotheses: patches stacked along their drift in sub-windows, each pair's context, globals.
+def patches(
+    frames: np.ndarray,
+    sub_window: np.ndarray,
+    column: np.ndarray,
+    lag_step: int,
+    n_sub: int,
+    n_lags: int,
+) -> np.ndarray:
+    """Cepstra around the delays of one window's hypotheses, stacked along their drift in sub-windows.
 
     Parameters
     ----------
-    analytic … minutes, energy : as of `pair_energy`. score : of `cheap_score`. once : (n_windows, n) said once a minute.
-    window : (n) index into `minutes` of each hypothesis. range_m, rate : (n) m and m/s.
-    index, seconds, strength, slope, phase, inverse, pad, fine_m, coarse_m : of `DelayTable`.
-    lag_step : quefrency samples from one lag to the next. sub_s : length of a sub-window, s.
-    out : (n, size) float32, overwritten.
+    frames : (n_frames, n_quefrency + 1) complex64, the window's of `analytic` as of `pair_energy`.
+    sub_window : (n_frames) of each frame, increasing.
+    column : (n_frames, n, n_pairs) quefrency index of each hypothesis; the last column where none.
+    lag_step : columns from one lag to the next.
+
+    Returns
+    -------
+    (n, n_pairs, n_sub, n_lags) complex64
     """
-    n_pairs, last = index.shape[0], analytic.shape[1] - 1
-    size = 2 * n_sub * n_lags
-    sums = np.empty((n_sub, n_lags), np.complex64)
-    count = np.empty(n_sub)
-    for h in range(range_m.shape[0]):
-        w = window[h]
-        row = out[h]
-        centre = pad + int(np.rint(range_m[h] / fine_m))
-        for p in range(n_pairs):
-            patch = row[p * size : (p + 1) * size]
-            context = row[n_pairs * size + 7 * p : n_pairs * size + 7 * p + 7]
-            if index[p, centre] == last:
-                patch[:] = 0.0
-                context[:] = 0.0
-                continue
-            sums[:] = 0.0
-            count[:] = 0.0
-            for t in range(start[w], stop[w]):
-                if not valid[t]:
-                    continue
-                later = frame_time[t] - minutes[w]
-                j = index[p, pad + int(np.rint((range_m[h] + rate[h] * later) / fine_m))]
-                s = min(max(int(np.floor(later / sub_s + 0.5 * n_sub)), 0), n_sub - 1)
-                count[s] += 1.0
-                if j == last:
-                    continue
-                j -= lag_step * (n_lags // 2)
-                frame = analytic[t]
-                for q in range(n_lags):
-                    sums[s, q] += frame[j + q * lag_step]
-            total = np.complex64(0.0)
-            for s in range(n_sub):
-                total += sums[s, n_lags // 2]
-                turn = phase[p, centre] * np.float32(1.0 / np.sqrt(max(count[s], 1.0)))
-                for q in range(n_lags):
-                    value = sums[s, q] * turn
-                    patch[2 * (s * n_lags + q)] = value.real
-                    patch[2 * (s * n_lags + q) + 1] = value.imag
-            context[0] = 1.0
-            context[1] = np.log1p((total.real**2 + total.imag**2) / max(count.sum(), 1.0))
-            context[2] = np.log1p(ghost(energy, score, w, p, centre, rate[h], index, slope, inverse, pad, fine_m,
-                                        coarse_m, rates))  # fmt: skip
-            context[3] = 1e4 * slope[p, centre]
-            context[4] = np.log(seconds[p, centre])
-            context[5] = np.abs(1e3 * slope[p, centre] * rate[h])
-            context[6] = strength[p, centre]
-        row[n_pairs * (size + 7)] = range_m[h] / depth_m
-        row[n_pairs * (size + 7) + 1 :] = once[w]
+    n_columns, reach = frames.shape[1], lag_step * (n_lags // 2)
+    held = np.zeros(frames.size + 2 * reach + 1, np.complex64)  # ends with a patch of zeros
+    held[: frames.size] = frames.ravel()
+    row = n_columns * np.arange(len(frames))[:, None, None]
+    place = np.where(column == n_columns - 1, frames.size, column + (row - reach))
+    found = np.empty((n_lags, *column.shape), np.complex64)
+    for lag in range(n_lags):
+        np.take(held, place, out=found[lag], mode="clip")
+        place += lag_step
+    edges = np.searchsorted(sub_window, np.arange(n_sub + 1))
+    sums = np.stack([found[:, a:b].sum(axis=1) for a, b in itertools.pairwise(edges)])
+    return np.ascontiguousarray(sums.transpose(2, 3, 0, 1))
 
 
-@njit(cache=True, nogil=True)
-def ghost(energy, score, w, p, centre, rate, index, slope, inverse, pad, fine_m, coarse_m, rates):
-    """Cheap score that other pairs give to the ranges at which another pair q has pair p's delay, the largest over q.
+def best_of_others(energy: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Cheap score without a pair's own share, the largest of a cell and its neighbours, for every path pair.
 
-    A ridge at pair p's delay may be pair q's, of a ship at another range; that ship's other pairs then show elsewhere.
-    `inverse` is the coarse range at which a pair has a delay; q's own share of the score there is left out.
+    Parameters
+    ----------
+    energy : (n_windows, n_pairs, n_rates, n_range) of `pair_energy`. score : of `cheap_score`.
+
+    Returns
+    -------
+    array like `energy`.
     """
-    n_pairs, n_rates, n_range = energy.shape[1:]
-    best = np.float32(0.0)
-    j = index[p, centre]
-    for q in range(n_pairs):
-        i = inverse[q, j]
-        if q == p or i < 0:
-            continue
-        there = slope[q, pad + int(np.rint(i * coarse_m / fine_m))]
-        if there == 0.0:
-            continue
-        k = int(np.rint((rate * slope[p, centre] / there - rates[0]) / (rates[1] - rates[0])))
-        if k < 0 or k >= n_rates:
-            continue
-        for kk in range(max(k - 1, 0), min(k + 2, n_rates)):
-            for ii in range(max(i - 1, 0), min(i + 2, n_range)):
-                best = max(best, score[w, kk, ii] - hinge(energy[w, q, kk, ii]))
+    best = np.empty_like(energy)
+    for window, cheap, out in zip(energy, score, best, strict=True):
+        np.subtract(cheap, hinge(window), out=out)
+        along = out.copy()
+        np.maximum(along[..., 1:], out[..., :-1], out=along[..., 1:])
+        np.maximum(along[..., :-1], out[..., 1:], out=along[..., :-1])
+        out[:] = along
+        np.maximum(out[:, 1:], along[:, :-1], out=out[:, 1:])
+        np.maximum(out[:, :-1], along[:, 1:], out=out[:, :-1])
     return best
 
 
-@njit(cache=True, nogil=True)
-def choose(score, peaks, spread, rates):
+def choose(score: np.ndarray, peaks: int, spread: int, rates: int) -> np.ndarray:
     """Hypotheses at and around the highest peaks, over range rate, of each window's score.
 
     Parameters
@@ -165,67 +153,59 @@ def choose(score, peaks, spread, rates):
     bool array like `score`.
     """
     n_windows, n_rates, n_range = score.shape
-    chosen = np.zeros(score.shape, np.bool_)
-    best = np.empty(n_range, np.float32)
-    rate = np.empty(n_range, np.int64)
-    for w in range(n_windows):
-        best[:] = score[w, 0]
-        rate[:] = 0
-        for k in range(1, n_rates):
-            for i in range(n_range):
-                if score[w, k, i] > best[i]:
-                    best[i] = score[w, k, i]
-                    rate[i] = k
-        for _ in range(peaks):
-            top = np.argmax(best)
-            if best[top] <= 0.0:
-                break
-            for i in range(max(top - spread, 0), min(top + spread + 1, n_range)):
-                first = min(max(rate[top] - rates // 2, 0), max(n_rates - rates, 0))
-                chosen[w, first : first + rates, i] = True
-                best[i] = -1.0
+    chosen = np.zeros(score.shape, bool)
+    best = score.max(axis=1)
+    first = np.clip(score.argmax(axis=1) - rates // 2, 0, max(n_rates - rates, 0))
+    around, taken = np.arange(-spread, spread + 1), np.arange(min(rates, n_rates))
+    for _ in range(peaks):
+        top = best.argmax(axis=1)
+        window = np.flatnonzero(best[np.arange(n_windows), top] > 0.0)
+        place = top[window, None] + around
+        inside = (place >= 0) & (place < n_range)
+        window = np.broadcast_to(window[:, None], place.shape)[inside]
+        rate, place = first[window, top[window]], place[inside]
+        chosen[window[:, None], rate[:, None] + taken, place[:, None]] = True
+        best[window, place] = -1.0
     return chosen
 
 
-@njit(cache=True, nogil=True)
-def carry_on(said, cheap, slope):
+def carry_on(said: np.ndarray, cheap: np.ndarray, slope: float) -> None:
     """Fill the range rates of a looked-at range that were not looked at themselves, in place.
 
     They take the nearest looked-at one's value, less `slope` times what the cheap score falls by; (window, rate, range).
     """
-    n_windows, n_rates, n_range = said.shape
-    for w in range(n_windows):
-        for i in range(n_range):
-            first, last = -1, -1
-            for k in range(n_rates):
-                if not np.isnan(said[w, k, i]):
-                    first = k if first < 0 else first
-                    last = k
-            if first < 0:
-                continue
-            for k in range(n_rates):
-                edge = first if k < first else last
-                if k < first or k > last:
-                    fall = max(cheap[w, edge, i] - cheap[w, k, i], np.float32(0.0))
-                    said[w, k, i] = said[w, edge, i] - np.float32(slope) * fall
+    looked = ~np.isnan(said)
+    window, place = np.nonzero(looked.any(axis=1))
+    known, values, score = (array[window, :, place] for array in (looked, said, cheap))
+    number = np.arange(said.shape[1])
+    first = known.argmax(axis=1)[:, None]
+    last = said.shape[1] - 1 - known[:, ::-1].argmax(axis=1)[:, None]
+    edge = np.clip(number, first, last)
+    fall = np.maximum(np.take_along_axis(score, edge, axis=1) - score, np.float32(0.0))
+    said[window, :, place] = np.take_along_axis(values, edge, axis=1) - np.float32(slope) * fall
 
 
-@njit(cache=True, nogil=True)
-def resample(coarse, range_below, range_weight, rate_below, rate_weight, fine):
-    """Bilinear interpolation of (n_windows, rate, range) onto (n_windows, range, rate), overwritten."""
-    row = np.empty(coarse.shape[1], np.float32)
-    for w in range(fine.shape[0]):
-        for i in range(fine.shape[1]):
-            b, a = range_below[i], range_weight[i]
-            for k in range(coarse.shape[1]):
-                row[k] = (np.float32(1.0) - a) * coarse[w, k, b] + a * coarse[w, k, b + 1]
-            for k in range(fine.shape[2]):
-                c, d = rate_below[k], rate_weight[k]
-                fine[w, i, k] = (np.float32(1.0) - d) * row[c] + d * row[c + 1]
+def resample(
+    coarse: np.ndarray,
+    range_below: np.ndarray,
+    range_weight: np.ndarray,
+    rate_below: np.ndarray,
+    rate_weight: np.ndarray,
+) -> np.ndarray:
+    """Bilinear interpolation of (n_windows, rate, range) onto (n_windows, range, rate), float32."""
+    number = np.arange(len(rate_below))
+    onto = np.zeros((coarse.shape[1], len(rate_below)), np.float32)
+    onto[rate_below, number] = 1.0 - rate_weight
+    onto[rate_below + 1, number] += rate_weight
+    fine = np.empty((len(coarse), len(range_below), len(rate_below)), np.float32)
+    for window, out in zip(coarse, fine, strict=True):
+        below = window[:, range_below]
+        below += range_weight * (window[:, range_below + 1] - below)
+        np.matmul(below.T, onto, out=out)
+    return fine
 
 
-@njit(cache=True, nogil=True)
-def share_out(llr, shape, slope, reach_range, reach_rate):
+def share_out(llr: np.ndarray, shape: np.ndarray, slope: float, reach_range: int, reach_rate: int) -> None:
     """Give the ratios of each window the fine shape of another's, in place; what lies within a reach of a cell stays.
 
     l ← log⟨e^l⟩ + s·a − log⟨e^(s·a)⟩, ⟨⟩ the mean over cells within the reach.
@@ -235,43 +215,44 @@ def share_out(llr, shape, slope, reach_range, reach_rate):
     llr, shape : (n_windows, n_range, n_rate) float32, of which `shape` is overwritten; windows with NaN are left alone.
     slope : s. reach_range, reach_rate : cells to either side.
     """
-    n_windows, n_range, n_rate = llr.shape
-    along, mean = np.empty((n_range, n_rate), np.float32), np.empty((n_range, n_rate), np.float32)
-    for w in range(n_windows):
-        if np.isnan(llr[w, 0, 0]) or np.isnan(shape[w, 0, 0]):
+    held = np.zeros((llr.shape[1] + 2 * reach_range, llr.shape[2] + 2 * reach_rate), np.float32)
+    for ratio, fine in zip(llr, shape, strict=True):
+        if np.isnan(ratio[0, 0]) or np.isnan(fine[0, 0]):
             continue
-        shape[w] *= slope
-        _log_mean_exp(shape[w], reach_range, reach_rate, along, mean)
-        for i in range(n_range):
-            for k in range(n_rate):
-                shape[w, i, k] -= mean[i, k]
-        _log_mean_exp(llr[w], reach_range, reach_rate, along, mean)
-        for i in range(n_range):
-            for k in range(n_rate):
-                llr[w, i, k] = mean[i, k] + shape[w, i, k]
+        fine *= np.float32(slope)
+        within, top = _sum_exp(ratio, reach_range, reach_rate, held)
+        shaped, highest = _sum_exp(fine, reach_range, reach_rate, held)
+        within /= shaped
+        np.log(within, out=within)
+        np.add(fine, within, out=ratio)
+        ratio += top - highest
 
 
-@njit(cache=True, nogil=True)
-def _log_mean_exp(values, reach_range, reach_rate, along, mean):
-    """Logarithm of the mean of the exponentials within the reach of each cell, edges cut off: into `mean`.
+def _sum_exp(
+    values: np.ndarray, reach_range: int, reach_rate: int, held: np.ndarray
+) -> tuple[np.ndarray, np.float32]:
+    """Sum of the exponentials, over that of the largest, within the reach of each cell, edges cut off; and the largest.
 
-    Sums are made anew for each cell: a running one would lose what is small beside a peak that it has left.
+    `held` has a margin of zeros as wide as the reach. Sums are made anew for each cell: a running one would lose what is
+    small beside a peak that it has left.
     """
-    n_range, n_rate = values.shape
     top = values.max()
-    for i in range(n_range):
-        for k in range(n_rate):
-            mean[i, k] = np.exp(max(values[i, k] - top, np.float32(-80.0)))
-        along[i] = 0.0
-        for shift in range(-reach_rate, reach_rate + 1):
-            for k in range(max(-shift, 0), n_rate - max(shift, 0)):
-                along[i, k] += mean[i, k + shift]
-    for i in range(n_range):
-        mean[i] = 0.0
-        low, high = max(i - reach_range, 0), min(i + reach_range + 1, n_range)
-        for j in range(low, high):
-            for k in range(n_rate):
-                mean[i, k] += along[j, k]
-        for k in range(n_rate):
-            cells = (high - low) * (min(k + reach_rate + 1, n_rate) - max(k - reach_rate, 0))
-            mean[i, k] = np.log(mean[i, k] / np.float32(cells)) + top
+    inner = held[reach_range : len(held) - reach_range, reach_rate : held.shape[1] - reach_rate]
+    np.subtract(values, top, out=inner)
+    np.exp(np.maximum(inner, np.float32(_LOWEST), out=inner), out=inner)
+    along = _sums(held.T, 2 * reach_rate + 1).T
+    return _sums(along, 2 * reach_range + 1), top
+
+
+def _sums(values: np.ndarray, width: int) -> np.ndarray:
+    """Sums of `width` consecutive rows, of pairs of pairs."""
+    count = len(values) - width + 1
+    total, at, power, span = np.zeros_like(values[:count]), 0, values, 1
+    while True:
+        if width & span:
+            total += power[at : at + count]
+            at += span
+        if 2 * span > width:
+            return total
+        power = power[:-span] + power[span:]
+        span *= 2

@@ -257,8 +257,7 @@ def _ghost_ranges(front: RangeFeatures, range_m: float) -> np.ndarray:
     """Ranges at which a pair has the delay that another pair has at `range_m`."""
     table = front.table
     centre = table.pad + round(range_m / 10.0)
-    lags = table.index[:, centre]
-    found = np.unique(table.inverse[:, lags])
+    found = np.unique(table.inverse[:, table.index[centre]])
     ranges = front.config.range_m[found[found >= 0]]
     return ranges[np.abs(ranges - range_m) > 3 * front.config.range_step_m]
 

@@ -107,11 +107,10 @@ def test_peaks_are_chosen_with_their_surroundings():
 
 def test_resampling_is_exact_at_the_grid_and_linear_between():
     coarse = np.random.default_rng(0).standard_normal((2, 4, 6)).astype(np.float32)
-    fine = np.empty((2, 11, 7), np.float32)
     halves = np.arange(11) / 2, np.arange(7) / 2
     below = [np.minimum(h.astype(np.int64), n - 2) for h, n in zip(halves, (6, 4), strict=True)]
     weight = [(h - b).astype(np.float32) for h, b in zip(halves, below, strict=True)]
-    kernels.resample(coarse, below[0], weight[0], below[1], weight[1], fine)
+    fine = kernels.resample(coarse, below[0], weight[0], below[1], weight[1])
     np.testing.assert_allclose(fine[:, ::2, ::2], coarse.transpose(0, 2, 1), rtol=1e-6)
     np.testing.assert_allclose(fine[:, 1, 0], (coarse[:, 0, 0] + coarse[:, 0, 1]) / 2, rtol=1e-5)
 
@@ -149,7 +148,7 @@ def test_a_lobe_keeps_its_mass_and_takes_the_analytic_shape():
     shape[0, 28, 11] = 40.0
     shape[0, 50, 3] = 80.0
     before = np.exp(llr.astype(float)).sum()
-    kernels.share_out(llr, shape.copy(), np.float32(0.15), 4, 4)
+    kernels.share_out(llr, shape.copy(), 0.15, 4, 4)
     assert np.unravel_index(llr[0].argmax(), llr[0].shape) == (28, 11)
     assert np.exp(llr.astype(float)).sum() == pytest.approx(before, rel=0.25)
     assert llr[0, 50, 3] < llr[0, 28, 11] - 3.0
@@ -158,6 +157,6 @@ def test_a_lobe_keeps_its_mass_and_takes_the_analytic_shape():
 def test_a_flat_shape_and_missing_minutes_change_nothing():
     llr = np.zeros((2, 12, 7), np.float32)
     llr[1] = np.nan
-    kernels.share_out(llr, np.full((2, 12, 7), -3.0, np.float32), np.float32(0.15), 4, 2)
+    kernels.share_out(llr, np.full((2, 12, 7), -3.0, np.float32), 0.15, 4, 2)
     np.testing.assert_allclose(llr[0], 0.0, atol=1e-5)
     assert np.isnan(llr[1]).all()
