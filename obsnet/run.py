@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pandas as pd
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 import obsnet
 from obsnet import netcdf, provenance
@@ -149,6 +151,8 @@ def track(
     return _run(stream, station, config, tracking=True, **options)
 
 
+# The matrices are small: a pool of BLAS threads takes longer to wake than to multiply.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def _run(
     waveforms: Any,
     station: Station,
@@ -174,7 +178,7 @@ def _run(
     clock.lap("model")
     sink = _FolderSink(folder, station) if folder is not None else _MemorySink()
     with sink:
-        for minutes in _stream(source, config, pipeline, progress, clock):
+        for minutes in _stream(source, config, pipeline, progress, clock, threads):
             sink.append(minutes)
             clock.lap("write")
         _require_minutes(sink.detections(), source, config)
@@ -209,9 +213,15 @@ def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: R
 
 
 def _stream(
-    source: Any, config: RunConfig, pipeline: Pipeline, progress: Progress | None, clock: Clock
+    source: Any,
+    config: RunConfig,
+    pipeline: Pipeline,
+    progress: Progress | None,
+    clock: Clock,
+    threads: int,
 ) -> Iterator[Minutes]:
-    for spectra in iter_spectra(source, config.spectra):
+    blocks = iter_spectra(source, config.spectra)
+    for spectra in blocks if threads == 1 else _ahead(blocks):
         clock.lap("spectra")
         finished = pipeline.push(spectra)
         clock.lap("detect")
@@ -223,6 +233,16 @@ def _stream(
     clock.lap("detect")
     if minutes is not None:
         yield minutes
+
+
+def _ahead(blocks: Iterable[xr.Dataset]) -> Iterator[xr.Dataset]:
+    """The same blocks, each made while the one before is worked on."""
+    waiting = iter(blocks)
+    with ThreadPoolExecutor(1) as beside:
+        coming = beside.submit(next, waiting, None)
+        while (block := coming.result()) is not None:
+            coming = beside.submit(next, waiting, None)
+            yield block
 
 
 def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:

@@ -10,6 +10,9 @@ import pandas as pd
 import pytest
 import xarray as xr
 from pyproj import Geod
+from threadpoolctl import threadpool_info
+
+from obsnet import Station, detect
 
 from .conftest import HOURS, START
 
@@ -268,3 +271,15 @@ def test_evaluate_reads_what_was_written(obsnet, record, finished):
     assert (status, errors) == (0, [])
     (ship,) = json.loads(told[0])["ships"]
     assert abs(ship["cpa_time_error_s"]) < 60
+
+
+def test_a_run_in_python_keeps_blas_to_one_thread(stream, inventory):
+    """Its matrices are small: a pool takes longer to wake than to multiply, and far longer beside other work."""
+
+    def threads():
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    before, seen = threads(), []
+    station = Station.from_stationxml(inventory)
+    detect(stream, station, endtime=START + 1800, heard=lambda run: seen.append(threads()))
+    assert (seen, threads()) == ([{1}], before)

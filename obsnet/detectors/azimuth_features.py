@@ -347,8 +347,6 @@ class _Base:
 
 def _invariants(base: _Base, low: int, high: int, ambiguity_deg: int) -> Cells:
     """Cells low … high − 1 of the base."""
-    from scipy.ndimage import uniform_filter1d
-
     start, stop = max(low - PAST, 0), min(high + AHEAD, len(base.index))
     flow, level, valid = (values[start:stop] for values in (base.flow, base.level, base.valid))
     inner = slice(low - start, high - start)
@@ -357,12 +355,12 @@ def _invariants(base: _Base, low: int, high: int, ambiguity_deg: int) -> Cells:
     near = _window_mean(unit, valid, AHEAD, AHEAD)[inner]
     past = _window_mean(unit, valid, PAST, 0)[inner]
     usual = _window_mean(level, valid, PAST, 0)[inner]
-    band = uniform_filter1d(near.real, 5, axis=1) + 1j * uniform_filter1d(near.imag, 5, axis=1)
+    band = _smooth(near, 5)
     unit, level, valid, modulus = unit[inner], level[inner], valid[inner], modulus[inner]
     background = base.background[low:high]
     channels = [
         np.clip(base.excess[low:high], -2.0, 3.0),
-        np.clip(level - uniform_filter1d(level, 43, axis=1), -1.5, 2.5),
+        np.clip(level - _smooth(level, 43), -1.5, 2.5),
         np.clip(level - usual, -2.0, 2.0),
         modulus,
         *_focus(unit, near),
@@ -373,6 +371,15 @@ def _invariants(base: _Base, low: int, high: int, ambiguity_deg: int) -> Cells:
     ]
     invariants = np.stack(channels, axis=1).astype(np.float32) * valid[:, None, None]
     return Cells(base.index[low:high], invariants, unit.astype(np.complex64), ambiguity_deg)
+
+
+def _smooth(values: np.ndarray, count: int) -> np.ndarray:
+    """Running mean over an odd number of bins along axis 1, reflected about the ends."""
+    padded = np.pad(values, ((0, 0), (count // 2, count // 2)), mode="symmetric")
+    total = np.zeros_like(values)
+    for shift in range(count):
+        total += padded[:, shift : shift + values.shape[1]]
+    return total / np.float32(count)
 
 
 def _focus(unit: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from scipy.interpolate import CubicSpline
 
 from obsnet.config import build
 from obsnet.detectors.analytic import AzimuthDetectorConfig, azimuth_maps
@@ -193,7 +192,14 @@ def _check_fits(card: ModelCard, config: AzimuthDetectorConfig, spectra: Spectra
 
 def _spline(count: int, azimuth_deg: np.ndarray) -> np.ndarray:
     """Matrix (count, azimuth) of the periodic cubic spline from the model's azimuths onto others."""
-    knots = np.arange(count + 1) * 360.0 / count
-    units = np.eye(count)
-    spline = CubicSpline(knots, np.concatenate([units, units[:1]]), bc_type="periodic")
-    return spline(azimuth_deg % 360.0).T.astype(np.float32)
+    place = azimuth_deg % 360.0 * count / 360.0
+    low = np.floor(place).astype(int)
+    right = place - low
+    left = 1.0 - right
+    unit, following = np.eye(count), np.roll(np.eye(count), 1, axis=1)
+    # Second derivatives from the first derivatives' continuity, in steps of the model's azimuths.
+    bend = np.linalg.solve(following + 4.0 * unit + following.T, 6.0 * (following - 2.0 * unit + following.T))
+    low, high = low % count, (low + 1) % count
+    values = left * unit[:, low] + right * unit[:, high]
+    values += ((left**3 - left) * bend[low].T + (right**3 - right) * bend[high].T) / 6.0
+    return values.astype(np.float32)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
 
 from obsnet.errors import ConfigError
 from obsnet.ocean.rays import parse_pair
 
 TABLE_II_DEPTH_M = 4340.0
+
+_erfc = np.vectorize(math.erfc, otypes=[float])
+"""As scipy.special's, which takes longer to import than curves to make."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,13 @@ class SkewNormal:
     def evaluate(self, range_m: np.ndarray) -> np.ndarray:
         """Cepstral amplitude at ranges [m]."""
         x = (np.asarray(range_m, float) - self.xi_m) / self.omega_m
-        return 2.0 * self.k / self.omega_m * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) * ndtr(self.alpha * x)
+        return (
+            self.k
+            / self.omega_m
+            * np.exp(-0.5 * x**2)
+            / np.sqrt(2.0 * np.pi)
+            * _erfc(-self.alpha * x / np.sqrt(2.0))
+        )
 
 
 @dataclass(frozen=True)

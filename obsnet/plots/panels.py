@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.image import AxesImage
@@ -117,10 +116,10 @@ def analytic_signal(values: np.ndarray) -> np.ndarray:
     As scipy.signal.hilbert, which takes a quarter of a second to import.
     """
     count = values.shape[-1]
-    spectrum = scipy.fft.fft(values, axis=-1)
+    spectrum = np.fft.fft(values, axis=-1)
     spectrum[..., 1 : (count + 1) // 2] *= 2.0
     spectrum[..., count // 2 + 1 :] = 0.0
-    return scipy.fft.ifft(spectrum, axis=-1)
+    return np.fft.ifft(spectrum, axis=-1)
 
 
 def farthest_km(run: Run) -> float:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.fft
 import xarray as xr
 
 from obsnet.errors import ConfigError, LayoutError
@@ -58,7 +57,7 @@ def cepstrogram(spectra: xr.Dataset) -> xr.DataArray:
     floor = np.finfo(np.float32).tiny
     log_modulus = np.log(np.maximum(modulus, floor))
     nfft = 2 * (frequency.size - 1)
-    cepstrum = scipy.fft.irfft(log_modulus, n=nfft, axis=1)[:, : nfft // 2 + 1]
+    cepstrum = np.fft.irfft(log_modulus, n=nfft, axis=1)[:, : nfft // 2 + 1]
     step = 1.0 / (2.0 * frequency[-1])
     return xr.DataArray(
         np.ascontiguousarray(cepstrum.T, dtype=np.float32),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import scipy.fft
 
 _GRID_TOLERANCE = 1e-5
 _MIN_LEVELS = 32
@@ -63,11 +62,13 @@ class FrameTransform:
         quadratic = np.exp(-1j * np.pi * (n**2 / period % 2))
         self._up = quadratic[: self.count].astype(np.complex64)
         self._down = quadratic[: self.bins].astype(np.complex64)
-        self._size = scipy.fft.next_fast_len(self.count + self.bins - 1)
+        from scipy.fft import next_fast_len
+
+        self._size = next_fast_len(self.count + self.bins - 1)
         kernel = np.zeros(self._size, complex)
         kernel[: self.bins] = np.conj(quadratic[: self.bins])
         kernel[-(self.count - 1) :] = np.conj(quadratic[self.count - 1 : 0 : -1])
-        self._kernel = scipy.fft.fft(kernel).astype(np.complex64)
+        self._kernel = np.fft.fft(kernel).astype(np.complex64)
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Spectra (frame, bin) complex64 of frames (frame, sample) float64, which are overwritten.
@@ -79,10 +80,11 @@ class FrameTransform:
         frames *= self._window
         windowed = frames.astype(np.float32)
         if not self._chirp:
-            return scipy.fft.rfft(windowed, axis=1)[:, : self.bins]
+            return np.fft.rfft(windowed, axis=1)[:, : self.bins].astype(np.complex64, copy=False)
         # Bluestein: kn = (k² + n² − (k − n)²) / 2 turns the sum into a convolution
-        mixed = scipy.fft.fft(windowed * self._up, self._size, axis=1)
-        return scipy.fft.ifft(mixed * self._kernel, axis=1)[:, : self.bins] * self._down
+        mixed = np.fft.fft(windowed * self._up, self._size, axis=1)
+        made = np.fft.ifft(mixed * self._kernel, axis=1)[:, : self.bins] * self._down
+        return made.astype(np.complex64, copy=False)
 
 
 def constant(samples: np.ndarray, count: int) -> np.ndarray:

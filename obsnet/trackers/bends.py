@@ -8,11 +8,11 @@ covariance that knows how rare straight is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
 
 from obsnet.trackers.posterior import FLOOR, Posterior, difference, student, widened
 
@@ -109,7 +109,7 @@ def bends(
     mean = models[best][0].mean
     log_share = np.array([model.log_evidence + odds for model, odds, _ in models])
     covariance = np.zeros((4, 4))
-    for share, (model, _, _) in zip(np.exp(log_share - logsumexp(log_share)), models, strict=True):
+    for share, (model, _, _) in zip(np.exp(log_share - np.logaddexp.reduce(log_share)), models, strict=True):
         apart = difference(model.mean[None, :4].copy(), mean[:4])[0]
         covariance += share * (model.covariance[:4, :4] + np.outer(apart, apart))
     return Bends(mean, covariance, best > 0, models[best][0].log_evidence)
@@ -175,7 +175,7 @@ def wander(reach_s: np.ndarray) -> np.ndarray:
 def _log_prior(points: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Log density of the bends of points, Student's t each."""
     dof, values = WANDER_DOF, points[:, BENDS]
-    constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
+    constant = math.lgamma((dof + 1) / 2) - math.lgamma(dof / 2) - 0.5 * np.log(dof * np.pi)
     density = constant - np.log(scale) - 0.5 * (dof + 1) * np.log1p((values / scale) ** 2 / dof)
     return np.where((abs(values) < LARGEST).all(axis=1), density.sum(axis=1), -np.inf)
 

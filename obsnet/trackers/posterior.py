@@ -7,11 +7,11 @@ tiles disagree about the course shows it, and widens the covariance (the sandwic
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
 
 from obsnet.kinematics import wrap180
 
@@ -116,8 +116,8 @@ def student(
     points[:, seen] += z @ root.T
     points[:, 2] %= 360.0
     constant = (
-        gammaln((dof + d) / 2)
-        - gammaln(dof / 2)
+        math.lgamma((dof + d) / 2)
+        - math.lgamma(dof / 2)
         - 0.5 * d * np.log(dof * np.pi)
         - np.log(np.diag(root)).sum()
     )

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.ndimage import uniform_filter1d
 
-from obsnet.detectors.azimuth_features import CHANNELS, AzimuthFeatures, Cells, cell_index
+from obsnet.detectors.azimuth_features import CHANNELS, AzimuthFeatures, Cells, _smooth, cell_index
 from obsnet.errors import LayoutError, ModelError
 from obsnet.layout import from_posix
 
@@ -121,3 +122,9 @@ def test_what_cannot_serve_is_refused():
     with pytest.raises(ModelError, match="24 Hz"):
         AzimuthFeatures().push(random_spectra(np.random.default_rng(6), frames=5, top_hz=12.5))
     assert isinstance(AzimuthFeatures().flush(), Cells)
+
+
+@pytest.mark.parametrize("count", [5, 43])
+def test_smoothing_is_a_running_mean_reflected_about_the_ends(count):
+    values = np.random.default_rng(0).standard_normal((7, 266)).astype(np.float32)
+    np.testing.assert_allclose(_smooth(values, count), uniform_filter1d(values, count, axis=1), atol=1e-6)

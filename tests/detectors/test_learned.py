@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
-from obsnet.detectors.learned import LearnedAzimuthDetector
+from obsnet.detectors.learned import LearnedAzimuthDetector, _spline
 from obsnet.detectors.model_card import MODELS, ModelFile, shipped
 from obsnet.errors import ModelError
 from obsnet.layout import from_posix, to_posix
@@ -139,3 +140,12 @@ def test_without_a_hydrophone_the_side_is_unknown(station):
     np.testing.assert_allclose(llr[:, :180], llr[:, 180:], atol=1e-4)
     assert maps["azimuth"].attrs["ambiguity_deg"] == 180
     assert np.median(abs(llr[5:-5, :180].argmax(axis=1) - 70)) <= 5
+
+
+@pytest.mark.parametrize("count", [24, 120])
+def test_between_the_models_azimuths_runs_the_periodic_cubic_spline(count):
+    knots = np.arange(count + 1) * 360.0 / count
+    values = np.random.default_rng(0).standard_normal(count)
+    azimuth = np.arange(-180.0, 540.0, 0.7)
+    exact = CubicSpline(knots, np.append(values, values[0]), bc_type="periodic")(azimuth % 360.0)
+    np.testing.assert_allclose(values @ _spline(count, azimuth), exact, atol=2e-6)
