@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 _HORIZONTALS = {"east", "north"}
 
+_SQUARED = {"m/s": "m2 s-2"}
+
 LONG_SILENCE_S = 86400.0
 """A silence longer than this has no rows; the record goes on after it as if it began there."""
 
@@ -410,7 +412,9 @@ def _power(spectra: xr.Dataset) -> xr.DataArray:
     thinned = power[: bins * 8].reshape(bins, 8, -1).mean(axis=1)
     centre = spectra["frequency"].values[: bins * 8].reshape(bins, 8).mean(axis=1)
     coords = {"spectrogram_frequency": centre, "time": spectra["time"].values}
-    return xr.DataArray(thinned, dims=("spectrogram_frequency", "time"), coords=coords, name="power")
+    unit = values.attrs.get("units", "1")
+    attrs = {"long_name": "squared amplitude of a tone", "units": _SQUARED.get(unit, f"{unit}2")}
+    return xr.DataArray(thinned, coords, ("spectrogram_frequency", "time"), "power", attrs)
 
 
 def _per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.DataArray:

@@ -20,7 +20,7 @@ LEVEL = (20.0, 150.0)
 """Power spectral densities shown, dB re 1 µPa²/Hz or 1 (nm/s)²/Hz."""
 MOST_CELLS = 180
 """Cells of a column of a map."""
-DENSITIES = {"Pa²": (120.0, "dB re 1 µPa²/Hz"), "(m/s)²": (180.0, "dB re 1 (nm/s)²/Hz")}
+DENSITIES = {"Pa2": (120.0, "dB re 1 µPa²/Hz"), "m2 s-2": (180.0, "dB re 1 (nm/s)²/Hz")}
 HANN_NOISE_BINS = 1.5
 """Equivalent noise bandwidth of a Hann window, in bins of 1 / its length."""
 
@@ -59,7 +59,7 @@ def columns(
         made["range"], axes["range"] = _pooled(values, maps["range"].values, "m")
     if "power" in features:
         power = features["power"].transpose("time", ...)
-        offset, unit = DENSITIES.get(power.attrs.get("units", "Pa²"), (0.0, "dB"))
+        offset, unit = DENSITIES.get(power.attrs.get("units", "Pa2"), (0.0, "dB"))
         density = power.values * window_s / (2.0 * HANN_NOISE_BINS)
         level = 10.0 * np.log10(np.maximum(density, np.finfo(np.float32).tiny)) + offset
         frequency = features["spectrogram_frequency"].values

@@ -77,7 +77,7 @@ def make_run(table, tracks, hours=8.0, parts=("azimuth", "range"), step=60.0, ga
         ridge[inside] += 35.0 * near[:, :, None] * np.exp(-0.5 * ((rate - v[:, None]) / 2.0) ** 2)[:, None, :]
     maps, features = {}, {}
     power = rng.exponential(1e-4, (len(time), 20))
-    features["power"] = (("time", "spectrogram_frequency"), power, {"units": "Pa²"})
+    features["power"] = (("time", "spectrogram_frequency"), power, {"units": "Pa2"})
     if "azimuth" in parts:
         maps["azimuth_llr"] = (("time", "azimuth"), bearing.astype(np.float32))
         maps["azimuth_coverage"] = ("time", np.ones(len(time), np.float32))

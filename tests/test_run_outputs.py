@@ -113,6 +113,11 @@ def test_maps_are_cf_netcdf(finished):
         )
 
 
+def test_the_spectrogram_has_units(finished):
+    with xr.open_dataset(finished / "features.nc") as features:
+        assert features["power"].attrs["units"] == "Pa2"
+
+
 def test_run_json_says_how(finished):
     info = json.loads((finished / "run.json").read_text())
     assert {
