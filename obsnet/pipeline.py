@@ -389,7 +389,7 @@ def _range_detector(
         from obsnet.detectors.learned_range import LearnedRangeDetector
 
         return LearnedRangeDetector.from_model(
-            table, config.models.range, config.range, config.spectra, shape=analytic
+            table, config.models.range, config.range, config.spectra, threads, analytic
         )
     return analytic
 

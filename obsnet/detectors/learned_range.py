@@ -9,7 +9,9 @@ of its own window alone, so that maps do not depend on how a record is cut.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +29,8 @@ from obsnet.layout import to_posix
 from obsnet.signals.spectra import SpectraConfig
 
 BATCH = 1024
+STRETCH = 30
+"""Minutes of a record at a time: what threads share."""
 CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 END_SLOPE = 0.1
@@ -88,6 +92,7 @@ class LearnedRangeDetector:
     calibration, features : as the network was trained and calibrated.
     config : RangeDetectorConfig, of which the grids and the windows hold.
     shape : detector of the fine shape; None leaves the network's blur.
+    threads : that share a record's minutes.
     """
 
     name = "learned"
@@ -100,7 +105,9 @@ class LearnedRangeDetector:
         features: RangeFeaturesConfig = RangeFeaturesConfig(),
         config: RangeDetectorConfig = RangeDetectorConfig(),
         shape: AnalyticRangeDetector | None = None,
+        threads: int | None = None,
     ) -> None:
+        self._threads = threads or os.cpu_count() or 1
         self.config, self.calibration, self._shape = config, calibration, shape
         self.window_s = config.window_s
         self.file: ModelFile | None = None
@@ -121,7 +128,7 @@ class LearnedRangeDetector:
 
         Parameters
         ----------
-        spectra : of the frames to come. threads : of onnxruntime. shape : detector of the fine shape.
+        spectra : of the frames to come. threads : that share a record's minutes. shape : detector of the fine shape.
 
         Raises
         ------
@@ -130,14 +137,14 @@ class LearnedRangeDetector:
         file = ModelFile.read(model or shipped("range"), "range")
         features = build(RangeFeaturesConfig, file.card.representation["features"])
         _check_fits(file.card, features, config, spectra)
-        session = file.session(threads or 1)
+        session = file.session()
         check_shapes(session, {"features": (None, features.size)}, (None,))
         calibration = build(RangeCalibration, file.card.calibration)
 
         def score(found: np.ndarray) -> np.ndarray:
             return run(session, {"features": found})
 
-        made = cls(propagation, score, calibration, features, config, shape)
+        made = cls(propagation, score, calibration, features, config, shape, threads)
         made.file = file
         return made
 
@@ -153,25 +160,43 @@ class LearnedRangeDetector:
         -------
         Dataset of range_llr (time, range, range_rate) float32, range_coverage (time) float32.
         """
-        config, grid = self.config, self._front.config
-        coarse = self.ratios(cepstrogram, minutes)
-        llr = kernels.resample(
-            coarse, *_weights(config.range_m, grid.range_m), *_weights(config.range_rate, grid.range_rate)
-        )
-        if self._shape is not None:
-            fine = self._shape.maps(cepstrogram, minutes)["range_llr"].values
-            reach = (
-                round(SHAPE_REACH_M / config.range_step_m),
-                round(SHAPE_REACH_MPS / _step(config.range_rate)),
-            )
-            kernels.share_out(llr, fine, SHAPE_SLOPE, *reach)
+        config = self.config
         times = to_posix(cepstrogram["time"].values)
         start, stop = window_bounds(times, minutes, config.window_s)
+        llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
+        fine = None if self._shape is None else self._shape.maps(cepstrogram, minutes)["range_llr"].values
+
+        def one(lo: int) -> None:
+            part = slice(lo, lo + STRETCH)
+            heard = cepstrogram[:, max(start[part].min() - 1, 0) : stop[part].max() + 1]
+            llr[part] = self._on_grid(self.ratios(heard, minutes[part]))
+            if fine is not None:
+                self._share_out(llr[part], fine[part])
+
+        parts = range(0, len(minutes), STRETCH)
+        if min(self._threads, len(parts)) > 1:
+            with ThreadPoolExecutor(self._threads) as pool:
+                list(pool.map(one, parts))
+        else:
+            for lo in parts:
+                one(lo)
         covered = coverage(
             ~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop(times)
         )
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
+
+    def _on_grid(self, coarse: np.ndarray) -> np.ndarray:
+        """Ratios of the features' grid on the configuration's, (minute, range, rate)."""
+        config, grid = self.config, self._front.config
+        return kernels.resample(
+            coarse, *_weights(config.range_m, grid.range_m), *_weights(config.range_rate, grid.range_rate)
+        )
+
+    def _share_out(self, llr: np.ndarray, fine: np.ndarray) -> None:
+        config = self.config
+        reach = round(SHAPE_REACH_M / config.range_step_m), round(SHAPE_REACH_MPS / _step(config.range_rate))
+        kernels.share_out(llr, fine, SHAPE_SLOPE, *reach)
 
     def ratios(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> np.ndarray:
         """Calibrated log-likelihood ratios on the features' own grid, (minute, rate, range) float32."""

@@ -5,11 +5,12 @@ import pytest
 import xarray as xr
 
 from obsnet.detectors import range_kernels as kernels
-from obsnet.detectors.analytic import RangeDetectorConfig
+from obsnet.detectors.analytic import AnalyticRangeDetector, RangeDetectorConfig
 from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration, presence_ratio
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
+from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.bottom import Bottom
 from obsnet.ocean.rays import propagation, tdoa
 from obsnet.ocean.sound_speed import SoundSpeed
@@ -160,3 +161,13 @@ def test_a_flat_shape_and_missing_minutes_change_nothing():
     kernels.share_out(llr, np.full((2, 12, 7), -3.0, np.float32), 0.15, 4, 2)
     np.testing.assert_allclose(llr[0], 0.0, atol=1e-5)
     assert np.isnan(llr[1]).all()
+
+
+def test_threads_share_the_minutes_and_change_nothing(table, cepstra, monkeypatch):
+    monkeypatch.setattr("obsnet.detectors.learned_range.STRETCH", 3)
+    shape = AnalyticRangeDetector(table, Amplitudes.broad().scaled_to(4000.0))
+    one, two = (LearnedRangeDetector(table, energies, shape=shape, threads=n) for n in (1, 2))
+    maps = [detector.maps(cepstra, MINUTES)["range_llr"].values for detector in (one, two)]
+    np.testing.assert_array_equal(*maps)
+    monkeypatch.setattr("obsnet.detectors.learned_range.STRETCH", 30)
+    np.testing.assert_allclose(one.maps(cepstra, MINUTES)["range_llr"].values, maps[0], atol=1e-4)
