@@ -61,6 +61,12 @@ def outputs(network: AzimuthNetwork, rows: AzimuthRows, batch: int = 16) -> Outp
     return Outputs(torch.cat(ratios), joined, np.array([number for number, _ in rows.rows]))
 
 
+def odds(said: Outputs) -> float:
+    """Minutes with a ship over minutes without one, of those that say something."""
+    weight, here = said.batch["weight"], (said.batch["state"] == HERE).any(2)
+    return float((weight * here).sum() / (weight * ~here).sum().clamp(min=1.0))
+
+
 def calibrate(said: Outputs, config: AzimuthTaskConfig) -> Calibration:
     """Slope and offset by maximum likelihood for either kind of azimuth, bounds from the number of independent windows."""
     slopes: list[float] = []
@@ -150,8 +156,9 @@ def metrics(
 
     Returns
     -------
-    nll : per minute, nats. ece : expected calibration error of presence. right, wrong : shares of minutes with one ship within
-    reach detected within 10°, or elsewhere. false_per_hour : minutes an hour without ships that alarm. minutes_with, minutes_without.
+    nll : per minute, nats. ece : expected calibration error of presence at the records' own odds of a ship: a ratio has no prior
+    of its own. right, wrong : shares of minutes with one ship within reach detected within 10°, or elsewhere. false_per_hour :
+    minutes an hour without ships that alarm. minutes_with, minutes_without.
     """
     weight = said.batch["weight"] > 0
     losses = minute_losses(ratio, said.batch, config)
@@ -164,7 +171,7 @@ def metrics(
     apart = ((best[..., None] - said.batch["turn"] + 0.5) % 1.0 - 0.5).abs() * 360.0
     apart = apart / (1.0 + said.batch["doubled"][:, None, None])
     near = (apart.masked_fill(said.batch["state"] != HERE, 360.0).min(2).values < 10.0) & alarm
-    sure = torch.sigmoid(presence + np.log(config.prior_odds))
+    sure = torch.sigmoid(presence + np.log(odds(said)))
     chosen = weight & ~any_unknown
     return {
         "nll": float((losses * weight).sum() / weight.sum()),

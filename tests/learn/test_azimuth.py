@@ -13,7 +13,7 @@ from obsnet.learn.azimuth import (  # noqa: E402
     augmented,
     minute_losses,
 )
-from obsnet.learn.calibration import calibration_error  # noqa: E402
+from obsnet.learn.calibration import Outputs, calibration_error, metrics  # noqa: E402
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters  # noqa: E402
 
 SMALL = AzimuthNetworkConfig(frequencies=20, hidden=6, gates=3, harmonics=12, azimuths=60, width=8)
@@ -165,6 +165,23 @@ def test_reading_between_azimuths_goes_round_the_circle():
     values = torch.arange(4.0).reshape(1, 1, 4)
     read = at_turn(values, torch.tensor([[[0.125, 0.875, 0.999999]]]))
     torch.testing.assert_close(read, torch.tensor([[[0.5, 1.5, 0.0]]]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
+def test_exact_ratios_are_calibrated_however_many_ships_a_set_holds(share):
+    """One number a minute, of unit variance, larger by 2 with a ship: 2x − 2 is its log-likelihood ratio."""
+    rng = np.random.default_rng(0)
+    ship = torch.tensor(rng.uniform(size=(40, 500)) < share)
+    exact = 2.0 * (torch.tensor(rng.standard_normal((40, 500))) + 2.0 * ship) - 2.0
+    state = torch.where(ship, HERE, ABSENT)[..., None]
+    batch = {
+        "state": state,
+        "turn": torch.zeros(40, 500, 1),
+        "weight": torch.ones(40, 500),
+        "doubled": torch.zeros(40),
+    }
+    said = Outputs(exact[..., None].expand(40, 500, 24), batch, np.arange(40))
+    assert metrics(said.ratio, said, AzimuthTaskConfig())["ece"] < 0.02
 
 
 def test_calibration_error_sees_overconfidence():
