@@ -35,7 +35,7 @@ CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 END_SLOPE = 0.1
 """Slope of a minute's ratio of presence beyond the strongest evidence that validation held."""
-SHAPE_SLOPE, SHAPE_REACH_M, SHAPE_REACH_MPS = 0.15, 280.0, 2.0
+SHAPE_SLOPE, SHAPE_REACH_M, SHAPE_REACH_MPS = 0.4, 280.0, 2.0
 """Power of the analytic likelihood ratio that shares out what the network gives to a lobe, and how far it moves it."""
 Scorer = Callable[[np.ndarray], np.ndarray]
 """Feature vectors (n, size) float32 in, log likelihood ratios (n) float32 out."""
@@ -196,7 +196,7 @@ class LearnedRangeDetector:
     def _share_out(self, llr: np.ndarray, fine: np.ndarray) -> None:
         config = self.config
         reach = round(SHAPE_REACH_M / config.range_step_m), round(SHAPE_REACH_MPS / _step(config.range_rate))
-        kernels.share_out(llr, fine, SHAPE_SLOPE, *reach)
+        kernels.share_out(llr, fine, SHAPE_SLOPE, *reach, config.range_m)
 
     def ratios(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> np.ndarray:
         """Calibrated log-likelihood ratios on the features' own grid, (minute, rate, range) float32."""

@@ -205,43 +205,51 @@ def resample(
     return fine
 
 
-def share_out(llr: np.ndarray, shape: np.ndarray, slope: float, reach_range: int, reach_rate: int) -> None:
+def share_out(
+    llr: np.ndarray, shape: np.ndarray, slope: float, reach_range: int, reach_rate: int, prior: np.ndarray
+) -> None:
     """Give the ratios of each window the fine shape of another's, in place; what lies within a reach of a cell stays.
 
-    l ← log⟨e^l⟩ + s·a − log⟨e^(s·a)⟩, ⟨⟩ the mean over cells within the reach.
+    l ← log⟨e^l⟩ + s·a − log⟨e^(s·a)⟩, ⟨⟩ the mean over cells within the reach; then all of a window are moved together so
+    that its ratio of presence, the sum of e^l over the prior, is what it was.
 
     Parameters
     ----------
     llr, shape : (n_windows, n_range, n_rate) float32, of which `shape` is overwritten; windows with NaN are left alone.
-    slope : s. reach_range, reach_rate : cells to either side.
+    slope : s. reach_range, reach_rate : cells to either side. prior : (n_range) weight of each range, even over range rate.
     """
     held = np.zeros((llr.shape[1] + 2 * reach_range, llr.shape[2] + 2 * reach_rate), np.float32)
+    inner = held[reach_range : len(held) - reach_range, reach_rate : held.shape[1] - reach_rate]
+    prior = prior.astype(np.float32)
     for ratio, fine in zip(llr, shape, strict=True):
         if np.isnan(ratio[0, 0]) or np.isnan(fine[0, 0]):
             continue
         fine *= np.float32(slope)
-        within, top = _sum_exp(ratio, reach_range, reach_rate, held)
-        shaped, highest = _sum_exp(fine, reach_range, reach_rate, held)
-        within /= shaped
+        top = _exp(ratio, inner)
+        before = np.log((prior @ inner).sum(dtype=float)) + top
+        within = _within(held, reach_range, reach_rate)
+        _exp(fine, inner)
+        within /= _within(held, reach_range, reach_rate)
         np.log(within, out=within)
         np.add(fine, within, out=ratio)
-        ratio += top - highest
+        top = _exp(ratio, inner)
+        ratio += np.float32(before - np.log((prior @ inner).sum(dtype=float)) - top)
 
 
-def _sum_exp(
-    values: np.ndarray, reach_range: int, reach_rate: int, held: np.ndarray
-) -> tuple[np.ndarray, np.float32]:
-    """Sum of the exponentials, over that of the largest, within the reach of each cell, edges cut off; and the largest.
-
-    `held` has a margin of zeros as wide as the reach. Sums are made anew for each cell: a running one would lose what is
-    small beside a peak that it has left.
-    """
+def _exp(values: np.ndarray, out: np.ndarray) -> np.float32:
+    """Exponentials over that of the largest, and the largest."""
     top = values.max()
-    inner = held[reach_range : len(held) - reach_range, reach_rate : held.shape[1] - reach_rate]
-    np.subtract(values, top, out=inner)
-    np.exp(np.maximum(inner, np.float32(_LOWEST), out=inner), out=inner)
-    along = _sums(held.T, 2 * reach_rate + 1).T
-    return _sums(along, 2 * reach_range + 1), top
+    np.subtract(values, top, out=out)
+    np.exp(np.maximum(out, np.float32(_LOWEST), out=out), out=out)
+    return top
+
+
+def _within(held: np.ndarray, reach_range: int, reach_rate: int) -> np.ndarray:
+    """Sums within the reach of each cell, edges cut off: `held` has a margin of zeros as wide as the reach.
+
+    Sums are made anew for each cell: a running one would lose what is small beside a peak that it has left.
+    """
+    return _sums(_sums(held.T, 2 * reach_rate + 1).T, 2 * reach_range + 1)
 
 
 def _sums(values: np.ndarray, width: int) -> np.ndarray:

@@ -145,7 +145,9 @@ def propagation(
 def propagation_table(config: OceanConfig, depth_m: float) -> xr.Dataset:
     """Propagation table of a station: the user's own file where one is named, else by ray tracing."""
     if config.propagation_file:
-        return read_propagation(config.propagation_file)
+        table = read_propagation(config.propagation_file)
+        table.attrs.setdefault("depth_m", float(depth_m))
+        return table
     return propagation(config.sound_speed(), depth_m, config.bottom, config.ranges(), config.paths)
 
 

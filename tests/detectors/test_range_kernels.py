@@ -166,7 +166,7 @@ def test_resampling_is_bilinear():
 
 @pytest.mark.parametrize("reach", [(4, 4), (2, 1), (0, 3)])
 def test_shares_are_those_of_the_means_within_reach(reach):
-    """Also beside a peak, and where what is summed differs by a factor of e⁷⁰."""
+    """Also beside a peak, and where what is summed differs by a factor of e⁷⁰; the ratio of presence stays."""
     generator = np.random.default_rng(6)
     llr = generator.uniform(-9, 15, (2, 25, 14)).astype(np.float32)
     shape = generator.uniform(-200, 300, (2, 25, 14)).astype(np.float32)
@@ -175,5 +175,8 @@ def test_shares_are_those_of_the_means_within_reach(reach):
         near = np.s_[w, max(i - reach[0], 0) : i + reach[0] + 1, max(k - reach[1], 0) : k + reach[1] + 1]
         mean, fine = (np.log(np.mean(np.exp(a[near].astype(float)))) for a in (llr, 0.15 * shape))
         expected[w, i, k] = mean + 0.15 * shape[w, i, k] - fine
-    kernels.share_out(llr, shape, 0.15, *reach)
+    prior = np.arange(25.0)
+    before, after = (np.log(np.einsum("i,wik->w", prior, np.exp(a))) for a in (llr.astype(float), expected))
+    expected += (before - after)[:, None, None]
+    kernels.share_out(llr, shape, 0.15, *reach, prior)
     np.testing.assert_allclose(llr, expected, rtol=1e-5, atol=3e-5)

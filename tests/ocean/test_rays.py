@@ -244,6 +244,19 @@ def test_tables_survive_netcdf(table, tmp_path):
     )
 
 
+def test_a_table_that_does_not_say_its_depth_takes_the_stations(table, tmp_path):
+    said, silent = tmp_path / "said.nc", tmp_path / "silent.nc"
+    bare = table.copy()
+    bare.attrs = {}
+    write_propagation(table, said)
+    write_propagation(bare, silent)
+    depths = [
+        propagation_table(OceanConfig(propagation_file=str(p)), 1234.0).attrs["depth_m"]
+        for p in (said, silent)
+    ]
+    assert depths == [DEPTH, 1234.0]
+
+
 def test_files_that_are_not_tables_are_refused(table, tmp_path):
     with pytest.raises(LayoutError, match="cannot read the propagation table"):
         read_propagation(tmp_path / "absent.nc")
