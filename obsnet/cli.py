@@ -43,7 +43,7 @@ Code = Annotated[
 Out = Annotated[Path, typer.Option("--out", help="Output folder.", parser=_folder)]
 DetectorName = Annotated[
     str | None,
-    typer.Option("--detector", help="learned-azimuth (default), analytic, learned-range or learned."),
+    typer.Option("--detector", help="learned (default), analytic, learned-azimuth or learned-range."),
 ]
 TrackerName = Annotated[str | None, typer.Option("--tracker", help="grid, bernoulli or focalization.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of parameters.")]
@@ -422,7 +422,7 @@ def reproduce(
         str | None,
         typer.Option(
             "--detector",
-            help="Of table1: learned-azimuth (default), analytic, learned-range, learned or all.",
+            help="Of table1: learned (default), analytic, learned-azimuth, learned-range or all.",
         ),
     ] = None,
     jobs: Jobs = None,

@@ -65,7 +65,7 @@ class RunConfig:
     `detector` may also be learned in azimuth or in range alone, for comparisons.
     """
 
-    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] = "learned-azimuth"
+    detector: Literal["learned", "analytic", "learned-azimuth", "learned-range"] = "learned"
     tracker: Literal["grid", "bernoulli", "focalization"] = "grid"
     spectra: SpectraConfig = field(default_factory=SpectraConfig)
     azigram: AzigramConfig = field(default_factory=AzigramConfig)
