@@ -79,7 +79,7 @@ def segments(
     phase = np.where(radial & (smooth["approaching"] < smooth["leaving"]), 1, phase)
     found: list[Segment] = []
     for lo, hi in _runs(heard[:settled]):
-        pieces = _split(time, phase, lo, hi)
+        pieces = _split(time, phase, lo, hi, config)
         found += pieces[:-1] if hi == settled and not ended else pieces
     return [segment for segment in found if segment.end - segment.start >= config.shortest_min * 60.0]
 
@@ -109,17 +109,22 @@ def _column(presence: pd.DataFrame, name: str, probability: float, config: Segme
     return np.minimum(mixed, config.minute_bound)
 
 
-def _split(time: np.ndarray, phase: np.ndarray, lo: int, hi: int) -> list[Segment]:
-    """Split a heard stretch halfway between each departure and the approach after it; set each piece's CPA."""
-    runs = [(sign, a, b) for sign in (-1, 1) for a, b in _runs(phase[lo:hi] == sign)]
-    runs = sorted(((a + lo, b + lo, sign) for sign, a, b in runs))
+def _split(time: np.ndarray, phase: np.ndarray, lo: int, hi: int, config: SegmentationConfig) -> list[Segment]:
+    """Split a heard stretch halfway between each departure and the approach after it; set each piece's CPA.
+
+    Two ships at once make the phase flicker: legs shorter than half of what makes a segment are none, and no cut leaves
+    less than a segment on either side. What is heard belongs to some piece.
+    """
+    shortest = 60.0 * config.shortest_min
+    runs = [(a + lo, b + lo, sign) for sign in (-1, 1) for a, b in _runs(phase[lo:hi] == sign)]
+    runs = sorted(run for run in runs if time[run[1] - 1] - time[run[0]] >= 0.5 * shortest)
     pieces: list[Segment] = []
     start, cpa = time[lo], None
     for (_, end, sign), (begin, _, following) in pairwise(runs):
         middle = 0.5 * (time[end - 1] + time[begin])
         if sign == -1 and following == 1:
             cpa = middle
-        elif sign == 1 and following == -1:
+        elif sign == 1 and following == -1 and min(middle - start, time[hi - 1] - middle) >= shortest:
             pieces.append(Segment(start, middle, cpa))
             start, cpa = middle, None
     pieces.append(Segment(start, time[hi - 1], cpa))

@@ -1,5 +1,7 @@
 """Segmentation: presence over hours becomes segments, a departure before an approach splits them."""
 
+from itertools import pairwise
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -58,6 +60,37 @@ def test_departure_before_an_approach_splits():
     assert first.end == second.start == pytest.approx(T0 + 60 * 500, abs=60 * 20)
     assert first.cpa == pytest.approx(T0 + 60 * 350, abs=600)
     assert second.cpa == pytest.approx(T0 + 60 * 650, abs=600)
+
+
+def two_at_once(seed, start=100, end=1100):
+    """Presence of a long stretch in whose middle one ship opens while another closes, either missed now and then."""
+    rng = np.random.default_rng(seed)
+    table = presence(ships=[(start, 200, end)])
+    table.iloc[start + 30 : end - 30, 2:] = [8.0, -6.0]
+    table.iloc[200:400, 2:] = [-6.0, 8.0]
+    both = np.where(rng.random((400, 2)) < 0.2, -6.0, 8.0)
+    table.iloc[400:800, 2:] = both
+    return table
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_heard_belongs_to_a_segment(seed):
+    found = segments(two_at_once(seed))
+    whole = segments(presence(ships=[(100, 600, 1100)]))
+    assert found[0].start == whole[0].start and found[-1].end == whole[0].end
+    assert all(before.end == after.start for before, after in pairwise(found))
+    assert all(segment.end - segment.start >= 3600 for segment in found)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_said_of_two_ships_at_once_while_the_record_goes_on_is_what_is_said_in_the_end(seed):
+    table = two_at_once(seed)
+    whole, said = segments(table), []
+    for minute in range(2, len(table), 3):
+        now = segments(table.iloc[:minute], ended=False)
+        assert now == whole[: len(now)] and now[: len(said)] == said
+        said = now
+    assert said == whole
 
 
 def test_silence_is_no_segment():
