@@ -104,6 +104,9 @@ RANGED = 4.0
 LOOSEST = (3600.0, 15_000.0)
 """Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
 
+LOOSEST_NEXT = (1200.0, 5000.0)
+"""The same of a further ship: what is left of a known one is a piece of course that fits many."""
+
 FINE = _Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
 
 
@@ -147,7 +150,7 @@ def search(
         found = finder.find(azimuth_llr, range_llr, least, jointly)
         if found is None or found.log_bayes_factor < least:
             break
-        if finder.believable(found) and (found.extra["heard"] >= 0.5 or not (tracks or known)):
+        if finder.believable(found) and (not (tracks or known) or _is_no_remainder(found)):
             tracks.append(found)
         azimuth_llr, range_llr = finder.without(found, azimuth_llr, range_llr)
     return tracks
@@ -455,6 +458,12 @@ def _apart(values: np.ndarray, most: int) -> list[tuple[int, int, int]]:
         found.append((int(values[:, i, j].argmax()), int(i), int(j)))
         plane[np.ix_(_near(i, 3, plane.shape[0]), _near(j, 2, plane.shape[1]))] = -1.0
     return found
+
+
+def _is_no_remainder(track: Track) -> bool:
+    """Whether a further ship is heard, and located, as what is left of a known one is not."""
+    located = track.std[0] < LOOSEST_NEXT[0] and track.std[1] < LOOSEST_NEXT[1]
+    return bool(located and track.extra["heard"] >= 0.5)
 
 
 def _near(index: Any, reach: int, count: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """When is one ship heard? Presence of every minute in, segments out.
 
 Minutes are averaged over an hour or two with the chance that a detector misses (paper's eqs 24–25); where a departure is
-followed by an approach a second ship has come, and the segment is split.
+followed by an approach a second ship has come, and the segment is split; whatever is heard stays in a segment.
 """
 
 from __future__ import annotations
@@ -109,7 +109,9 @@ def _column(presence: pd.DataFrame, name: str, probability: float, config: Segme
     return np.minimum(mixed, config.minute_bound)
 
 
-def _split(time: np.ndarray, phase: np.ndarray, lo: int, hi: int, config: SegmentationConfig) -> list[Segment]:
+def _split(
+    time: np.ndarray, phase: np.ndarray, lo: int, hi: int, config: SegmentationConfig
+) -> list[Segment]:
     """Split a heard stretch halfway between each departure and the approach after it; set each piece's CPA.
 
     Two ships at once make the phase flicker: legs shorter than half of what makes a segment are none, and no cut leaves

@@ -6,7 +6,7 @@ import xarray as xr
 
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
-from obsnet.trackers.grid_search import GridSearchConfig, search
+from obsnet.trackers.grid_search import GridSearchConfig, _Finder, search
 from obsnet.trackers.score_maps import lobe
 from obsnet.trackers.track import Segment, Track
 
@@ -129,6 +129,23 @@ def test_the_next_ship_on_the_lane_is_not_taken_for_the_one_long_gone():
     (found,) = search(maps_of([coming], MINUTES, np.random.default_rng(4)), SEGMENT, delay, known=[known])
     assert abs(found.motion.cpa_time - coming.cpa_time) < 60.0
     assert found.end - found.start > 200 * 60.0
+
+
+@pytest.mark.parametrize(("std", "count"), [((30.0, 200.0), 2), ((1500.0, 3000.0), 1), ((300.0, 9000.0), 1)])
+def test_what_is_located_nowhere_may_be_a_first_ship_but_no_further_one(monkeypatch, std, count):
+    """What is left of a known ship is a piece of course that fits many; of a far ship alone no more may be known."""
+
+    def ship(cpa_range, spread):
+        course = StraightCourse(T0 + 7000.0, cpa_range, 60.0, 8.0)
+        extra = {"heard": 0.9, "log_bayes_factor_fixed": 200.0}
+        covariance = np.diag([*spread, 5.0, 0.5]) ** 2
+        return Track(MINUTES[0], MINUTES[-1], course, covariance, 300.0, extra=extra)
+
+    for first in (std, (30.0, 200.0)):
+        found = iter([ship(10_000.0, first), ship(-15_000.0, std), None])
+        monkeypatch.setattr(_Finder, "find", lambda self, *maps, found=found: next(found))
+        maps = maps_of([], MINUTES, np.random.default_rng(1))
+        assert len(search(maps, SEGMENT, delay)) == count
 
 
 def test_lobe_of_a_ship_ends_where_anothers_begins():
