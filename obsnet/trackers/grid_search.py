@@ -104,7 +104,7 @@ RANGED = 4.0
 LOOSEST = (3600.0, 15_000.0)
 """Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
 
-LOOSEST_NEXT = (1200.0, 5000.0)
+LOOSEST_NEXT = (1800.0, 10_000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
 FINE = _Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
