@@ -131,7 +131,9 @@ def test_the_next_ship_on_the_lane_is_not_taken_for_the_one_long_gone():
     assert found.end - found.start > 200 * 60.0
 
 
-@pytest.mark.parametrize(("std", "count"), [((30.0, 200.0), 2), ((2000.0, 3000.0), 1), ((300.0, 12_000.0), 1)])
+@pytest.mark.parametrize(
+    ("std", "count"), [((30.0, 200.0), 2), ((2000.0, 3000.0), 1), ((300.0, 12_000.0), 1)]
+)
 def test_what_is_located_nowhere_may_be_a_first_ship_but_no_further_one(monkeypatch, std, count):
     """What is left of a known ship is a piece of course that fits many; of a far ship alone no more may be known."""
 
