@@ -55,7 +55,9 @@ def test_importing_brings_nothing_heavy():
 
 def test_a_run_and_a_station_bring_no_compiler():
     """Loading compiled loops would cost a process more time and memory than they save it."""
-    assert not {"numba", "matplotlib", "scipy"} & set(heavy_after("import obsnet.run, obsnet.live.watch"))
+    assert not {"numba", "matplotlib", "scipy"} & set(
+        heavy_after("import obsnet.run, obsnet.live.watch, obsnet.detectors.learned_range")
+    )
 
 
 def test_the_check_of_imports_can_fail():

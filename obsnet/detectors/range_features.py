@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 import xarray as xr
 
 from obsnet.detectors import range_kernels as kernels
@@ -362,7 +361,8 @@ def analytic_cepstrum(
     """
     n = quefrency_s.size
     scaled = np.nan_to_num(frames) / noise_std(quefrency_s, nfft).astype(np.float32)
-    spectrum = scipy.fft.dct(scaled.astype(np.float32, copy=False), type=1, axis=1)
+    whole = np.concatenate([scaled, scaled[:, -2:0:-1]], axis=1, dtype=np.float32)
+    spectrum = np.fft.rfft(whole, axis=1).real.astype(np.float32, copy=False)
     frequency = np.arange(n) / (2.0 * quefrency_s[-1])
     weight = np.interp(frequency, band_hz, (0.0, 1.0, 1.0, 0.0))
     size = 2 * (n - 1)
@@ -370,7 +370,7 @@ def analytic_cepstrum(
     spectrum *= gain.astype(np.float32)
     out = np.zeros((len(frames), OVERSAMPLING * (n - 1) + 2), np.complex64)
     # Of a real spectrum, the transform forward is the one backward conjugated.
-    out[:, :-1] = scipy.fft.rfft(spectrum, OVERSAMPLING * size, axis=1)
+    out[:, :-1] = np.fft.rfft(spectrum, OVERSAMPLING * size, axis=1)
     return np.conjugate(out, out=out)
 
 
