@@ -97,8 +97,10 @@ def test_a_ship_at_midnight_is_one_track(night):
     row, expected = found.iloc[0], one.tracks[0].row(1)
     assert row["start"] < pd.Timestamp(MIDNIGHT.datetime, tz="UTC") < row["end"]
     assert row["track"].startswith("XX.SIM01-20130522T00") and str(row["date"]) == "2013-05-21"
-    for name in ("cpa_distance_m", "course_deg", "speed_mps", "cpa_time_std_s"):
+    for name in ("cpa_distance_m", "course_deg", "speed_mps"):
         assert row[name] == pytest.approx(expected[name], rel=1e-3)
+    # Drawn from the posterior of maps that agree to one step of their packing.
+    assert row["cpa_time_std_s"] == pytest.approx(expected["cpa_time_std_s"], rel=0.02)
 
 
 def test_without_a_run_in_the_first_minutes_would_differ(night, config):
