@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -30,7 +29,7 @@ from obsnet.ocean.rays import propagation_table, travel_time
 from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
-from obsnet.signals.spectra import iter_spectra
+from obsnet.signals.spectra import ahead, iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
@@ -221,7 +220,7 @@ def _stream(
     threads: int,
 ) -> Iterator[Minutes]:
     blocks = iter_spectra(source, config.spectra)
-    for spectra in blocks if threads == 1 else _ahead(blocks):
+    for spectra in blocks if threads == 1 else ahead(blocks):
         clock.lap("spectra")
         finished = pipeline.push(spectra)
         clock.lap("detect")
@@ -233,16 +232,6 @@ def _stream(
     clock.lap("detect")
     if minutes is not None:
         yield minutes
-
-
-def _ahead(blocks: Iterable[xr.Dataset]) -> Iterator[xr.Dataset]:
-    """The same blocks, each made while the one before is worked on."""
-    waiting = iter(blocks)
-    with ThreadPoolExecutor(1) as beside:
-        coming = beside.submit(next, waiting, None)
-        while (block := coming.result()) is not None:
-            coming = beside.submit(next, waiting, None)
-            yield block
 
 
 def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
