@@ -108,8 +108,8 @@ def export_detector(config: DictConfig) -> None:
     """Write the ONNX file of ``config.weights`` to ``config.out`` and check it."""
     values = plain(config)
     export, parity = _exporting(values["weights"])
-    path = export(values["weights"], values["out"])
-    worst = parity(values["weights"], path, values["prepared"])
+    path = export(values["weights"], values["out"], values["calibrate"])
+    worst = parity(values["weights"], path, values["prepared"], values["calibrate"])
     say(f"{path}: {path.stat().st_size} bytes, differs from PyTorch by {worst:.1e} at most")
 
 
@@ -117,7 +117,7 @@ def verify_export(config: DictConfig) -> None:
     """Check the ONNX file of ``config.out`` against ``config.weights`` on real maps."""
     values = plain(config)
     _, parity = _exporting(values["weights"])
-    worst = parity(values["weights"], values["out"], values["prepared"])
+    worst = parity(values["weights"], values["out"], values["prepared"], values["calibrate"])
     say(f"{values['out']}: differs from PyTorch by {worst:.1e} at most")
 
 

@@ -30,6 +30,8 @@ from obsnet.signals.spectra import SpectraConfig
 
 TOLERANCE = 1e-4
 INPUTS = ("invariants", "phasor", "doubled")
+RAW = Calibration(lowest=-100.0, highest=100.0)
+"""No calibration."""
 
 
 class CalibratedAzimuth(nn.Module):
@@ -48,18 +50,19 @@ class CalibratedAzimuth(nn.Module):
         return bounded(ratio, self.calibration.lowest, self.calibration.highest)
 
 
-def export(weights: str | Path, out: str | Path) -> Path:
+def export(weights: str | Path, out: str | Path, calibrate: bool = True) -> Path:
     """Write a model with its card, and its SHA-256 beside it.
 
     Parameters
     ----------
-    weights : a run's ``weights.pt``. out : the ONNX file.
+    weights : a run's ``weights.pt``. out : the ONNX file. calibrate : False leaves the network's output as it is.
 
     Raises
     ------
     ModelError : the weights cannot be read, or the model is too large.
     """
     network, calibration, about = restored(weights)
+    calibration = calibration if calibrate else RAW
     calibrated = CalibratedAzimuth(network, calibration).eval()
     card = azimuth_card(network, calibration, about)
     out = Path(out)
@@ -155,7 +158,9 @@ def record_digest(path: Path, digest: str) -> None:
     write_text(listed, json.dumps(known | {path.name: digest}, indent=1, sort_keys=True) + "\n")
 
 
-def parity(weights: str | Path, model: str | Path, prepared: str | Path, rows: int = 24) -> float:
+def parity(
+    weights: str | Path, model: str | Path, prepared: str | Path, calibrate: bool = True, rows: int = 24
+) -> float:
     """Largest difference of the ONNX file from PyTorch on rows of validation records.
 
     Raises
@@ -163,7 +168,7 @@ def parity(weights: str | Path, model: str | Path, prepared: str | Path, rows: i
     ModelError : it exceeds `TOLERANCE`.
     """
     network, calibration, _ = restored(weights)
-    calibrated = CalibratedAzimuth(network, calibration).eval()
+    calibrated = CalibratedAzimuth(network, calibration if calibrate else RAW).eval()
     held = AzimuthRows(PreparedSet(prepared), "validation", AzimuthTaskConfig())
     session = ModelFile.read(model, "azimuth").session()
     worst = 0.0

@@ -20,7 +20,10 @@ BLOCK_CELLS = 3
 
 @dataclass(frozen=True)
 class AzimuthNetworkConfig:
-    """Sizes: frequencies in, hidden channels of the gates, gates, harmonics, azimuths, channels and reach around the circle."""
+    """Sizes: frequencies in, hidden channels of the gates, gates, harmonics, azimuths, channels and reach around the circle.
+
+    With `kernel` 1 every azimuth is judged by itself: no circular refinement.
+    """
 
     frequencies: int = 266
     hidden: int = 12
@@ -117,11 +120,12 @@ class _Circular(nn.Module):
     def __init__(self, inputs: int, outputs: int, kernel: int, dilation: int) -> None:
         super().__init__()
         self.reach = dilation * (kernel // 2)
-        self.conv = nn.Conv1d(inputs, outputs, kernel, dilation=dilation)
+        self.conv = nn.Conv1d(inputs, outputs, kernel, dilation=max(dilation, 1))
 
     def forward(self, values: Tensor) -> Tensor:
-        around = torch.cat([values[..., -self.reach :], values, values[..., : self.reach]], -1)
-        return self.conv(around)
+        if self.reach:
+            values = torch.cat([values[..., -self.reach :], values, values[..., : self.reach]], -1)
+        return self.conv(values)
 
 
 def _powers(real: Tensor, imag: Tensor, count: int) -> Tensor:

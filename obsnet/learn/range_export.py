@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from obsnet.detectors.learned_range import RangeCalibration
 from obsnet.detectors.model_card import ModelCard, ModelFile, run
 from obsnet.detectors.range_features import CONTEXT, GLOBALS
 from obsnet.errors import ModelError
@@ -16,9 +17,12 @@ from obsnet.learn.export import TOLERANCE, origin, write_onnx
 from obsnet.learn.range_training import RangeExamples, RangeTaskConfig, restored
 from obsnet.signals.spectra import SpectraConfig
 
+RAW = RangeCalibration(lowest=-100.0, highest=100.0)
+"""No calibration; the cheap score's line is the one that fitting begins with."""
 
-def export_range(weights: str | Path, out: str | Path) -> Path:
-    """Write a range model with its card, and its SHA-256 beside it; the calibration stands in the card."""
+
+def export_range(weights: str | Path, out: str | Path, calibrate: bool = True) -> Path:
+    """Write a range model with its card, and its SHA-256 beside it; the calibration, if wanted, stands in the card."""
     network, calibration, features, about = restored(weights)
     spectra = SpectraConfig()
     card = ModelCard(
@@ -30,7 +34,7 @@ def export_range(weights: str | Path, out: str | Path) -> Path:
             "spectra": {name: getattr(spectra, name) for name in ("window_s", "hop_s", "analysis_rate_hz")},
         },
         grids={"features": features.size},
-        calibration=asdict(calibration),
+        calibration=asdict(calibration if calibrate else RAW),
         **origin(network, about),
     )
     out = Path(out)
@@ -39,8 +43,10 @@ def export_range(weights: str | Path, out: str | Path) -> Path:
     return out
 
 
-def range_parity(weights: str | Path, model: str | Path, prepared: str | Path, examples: int = 100) -> float:
-    """Largest difference of the ONNX file from PyTorch on hypotheses of validation records.
+def range_parity(
+    weights: str | Path, model: str | Path, prepared: str | Path, calibrate: bool = True, examples: int = 100
+) -> float:
+    """Largest difference of the ONNX file from PyTorch on hypotheses of validation records; no calibration is in it.
 
     Raises
     ------

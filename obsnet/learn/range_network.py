@@ -9,17 +9,26 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeaturesConfig
+from obsnet.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class RangeNetworkConfig:
-    """Widths of the encoder, of what a pair says, and of the head; dropout; the ratio lies within ±bound, smoothly."""
+    """Widths of the encoder, of what a pair says, and of the head; dropout; the ratio lies within ±bound, smoothly.
+
+    `blind` names members of `CONTEXT` that the network does not see, to learn what they are worth.
+    """
 
     hidden: int = 48
     code: int = 16
     head: int = 48
     dropout: float = 0.1
     bound: float = 12.0
+    blind: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not set(self.blind) <= set(CONTEXT[1:]):
+            raise ConfigError(f"blind may hold {', '.join(CONTEXT[1:])}, found {', '.join(self.blind)}")
 
 
 class RangeNetwork(nn.Module):
@@ -49,6 +58,9 @@ class RangeNetwork(nn.Module):
         )  # fmt: skip
         self.names: Tensor
         self.register_buffer("names", torch.eye(n_pairs))
+        self.seen: Tensor
+        seen = torch.tensor([float(name not in config.blind) for name in CONTEXT])
+        self.register_buffer("seen", seen, persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
         """Log likelihood ratios (n) of feature vectors (n, size) of `obsnet.detectors.range_features`."""
@@ -58,6 +70,8 @@ class RangeNetwork(nn.Module):
         context = features[:, patch_size : patch_size + n_pairs * len(CONTEXT)].reshape(
             -1, n_pairs, len(CONTEXT)
         )
+        if self.config.blind:
+            context = context * self.seen
         once = features[:, patch_size + n_pairs * len(CONTEXT) :]
         stacked = patch.sum(dim=2)
         coherent = torch.log1p((stacked**2).sum(dim=-1) / n_sub)

@@ -26,11 +26,15 @@ from obsnet.twin.station import simulate
 
 @dataclass(frozen=True)
 class HydrophoneData:
-    """Simulated records of the hydrophone alone: how many of each split, and their length. Labels are the twin's truth."""
+    """Simulated records of the hydrophone alone: how many of each split, and their length. Labels are the twin's truth.
+
+    With `depth_m` every station stands at that depth; by default each draws its own.
+    """
 
     train: int = 160
     validation: int = 50
     hours: float = 5.0
+    depth_m: float | None = None
 
 
 FIRST_SEEDS = {"train": 0, "validation": 10_000}
@@ -125,7 +129,9 @@ def prepare_hydrophone(folder: str | Path, data: HydrophoneData, progress: Any =
     for done, (split, seed) in enumerate(jobs, 1):
         name = f"range-{split}-{seed:05d}"
         if not prepared.has(name):
-            prepared.write(hydrophone_record(name, split, draw_record(seed, data.hours)))
+            prepared.write(
+                hydrophone_record(name, split, draw_record(seed, data.hours, depth_m=data.depth_m))
+            )
         if progress is not None:
             progress(done, len(jobs))
     prepared.write_provenance(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,23 @@ def test_turning_the_sensor_turns_the_map():
         half = net(invariants, turned(phasor, 3.0), doubled)
     expected = (before + before.roll(1, 2)) / 2
     assert (half - expected).abs().max() < 0.15 * (before.max() - before.min())
+
+
+def test_without_refinement_an_azimuth_does_not_hear_its_neighbours():
+    net = network(replace(SMALL, kernel=1))
+    around = torch.zeros(1, 12, 60)
+    around[0, :, 10] = 1.0
+    with torch.no_grad():
+        heard = net.last(net.refine(net.enter(around)))[0, 0]
+        refined = network().enter(around)[0]
+        silent = network().enter(torch.zeros_like(around))[0]
+    assert (heard != heard[30]).nonzero().flatten().tolist() == [10]
+    assert ((refined != silent).any(0)).nonzero().flatten().tolist() == list(range(7, 14))
+    invariants, phasor, doubled = inputs()
+    with torch.no_grad():
+        before = net(invariants, phasor, doubled)
+        after = net(invariants, turned(phasor, 90.0), doubled)
+    torch.testing.assert_close(after, before.roll(15, 2), atol=2e-4, rtol=1e-3)
 
 
 def test_the_network_is_small():

@@ -4,6 +4,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig  # noqa: E402
+from obsnet.errors import ConfigError  # noqa: E402
 from obsnet.learn.networks import parameters  # noqa: E402
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss  # noqa: E402
 
@@ -26,6 +27,21 @@ def test_pairs_that_do_not_exist_change_nothing():
     assert torch.allclose(network(features), network(changed))
     changed[:, : size // 5] = 7.0
     assert not torch.allclose(network(features), network(changed))
+
+
+def test_a_network_blind_to_ghosts_does_not_see_them():
+    config = RangeFeaturesConfig()
+    features = torch.randn(4, config.size)
+    size = int(np.prod(config.patch_shape))
+    features[:, size :: len(CONTEXT)][:, :5] = 1.0
+    changed = features.clone()
+    changed[:, size + CONTEXT.index("ghost") :: len(CONTEXT)][:, :5] += 3.0
+    torch.manual_seed(0)
+    blind, seeing = RangeNetwork(RangeNetworkConfig(blind=("ghost",))).eval(), RangeNetwork().eval()
+    assert torch.allclose(blind(features), blind(changed))
+    assert not torch.allclose(seeing(features), seeing(changed))
+    with pytest.raises(ConfigError, match="blind may hold energy"):
+        RangeNetworkConfig(blind=("exists",))
 
 
 def test_the_loss_of_a_network_that_knows_nothing_is_that_of_the_prior():

@@ -14,7 +14,7 @@ from obsnet.learn.range_calibration import Heard, calibrate, measure  # noqa: E4
 from obsnet.learn.range_examples import RangeExamplesConfig  # noqa: E402
 from obsnet.learn.range_export import export_range, range_parity  # noqa: E402
 from obsnet.learn.range_network import RangeNetworkConfig  # noqa: E402
-from obsnet.learn.range_records import HydrophoneData, prepare_hydrophone  # noqa: E402
+from obsnet.learn.range_records import HydrophoneData, draw_record, prepare_hydrophone  # noqa: E402
 from obsnet.learn.range_training import (  # noqa: E402
     RangeTaskConfig,
     cepstrogram_of,
@@ -137,6 +137,22 @@ def test_hydrophone_records_are_prepared_once(tmp_path, monkeypatch):
     assert len(known_minutes(held)) == len(held.minute)
     monkeypatch.setattr("obsnet.learn.range_records.draw_record", None)
     assert prepare_hydrophone(tmp_path, data).digest() == made.digest()
+
+
+def test_hydrophone_records_may_share_a_depth():
+    assert draw_record(0, 0.2, depth_m=3000.0).ocean.depth_m == 3000.0
+    assert abs(draw_record(0, 0.2).ocean.depth_m - 3000.0) > 100.0
+
+
+def test_without_calibration_the_exported_ratios_are_the_networks_own(trained, prepared, tmp_path):
+    raw = export_range(trained[0], tmp_path / "raw.onnx", calibrate=False)
+    assert range_parity(trained[0], raw, prepared.folder, calibrate=False) < 1e-4
+    held = prepared.read("r2")
+    detector = LearnedRangeDetector.from_model(held.table(), raw)
+    said, _ = detector.scores(cepstrogram_of(held), held.minute[5:8])
+    ratios = detector.ratios(cepstrogram_of(held), held.minute[5:8])
+    looked = np.isfinite(said)
+    np.testing.assert_allclose(ratios[looked], said[looked], atol=1e-3)
 
 
 def test_sets_without_ships_are_refused(tmp_path):

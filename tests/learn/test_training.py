@@ -124,6 +124,12 @@ def test_the_file_says_what_pytorch_says(run, prepared, model):
     assert model.stat().st_size < 2_000_000
 
 
+def test_without_calibration_the_file_says_what_the_network_says(run, prepared, tmp_path):
+    raw = export(run / "weights.pt", tmp_path / "raw.onnx", calibrate=False)
+    assert parity(run / "weights.pt", raw, prepared.folder, calibrate=False) < 1e-4
+    assert ModelFile.read(raw, "azimuth").card.calibration["slope"] == [1.0, 1.0]
+
+
 def test_parity_fails_for_other_weights(prepared, model, tmp_path):
     other = replace(TRAINER, seed=5, epochs=1)
     training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), other, say=lambda text: None)
