@@ -133,7 +133,7 @@ def search(
 
     Returns
     -------
-    list of Track. Without azimuth maps the course is not observed (infinite variance).
+    list of Track. Without azimuth maps, or with none but empty ones, the course is not observed (infinite variance).
 
     Source: Trabattoni et al. 2023, section III.E.
     """
@@ -141,6 +141,8 @@ def search(
     if read is None:
         return []
     times, azimuth_llr, range_llr = read
+    given = {"azimuth_llr": azimuth_llr, "range_llr": range_llr}
+    maps = maps.drop_vars([name for name in given if name in maps and given[name] is None])
     finder = _Finder(maps, times, delay, config, threads)
     for track in known:
         # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.

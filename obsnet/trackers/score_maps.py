@@ -64,7 +64,10 @@ class ScoreMaps:
 def tiles(
     maps: xr.Dataset, segment: Segment, tile_s: float
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None] | None:
-    """Tile times and the maps there, read from disk no further than that; none if there are fewer than three."""
+    """Tile times and the maps there, read from disk no further than that; none if there are fewer than three.
+
+    Maps of which no tile has data are None, as those that are not there.
+    """
     times = to_posix(maps["time"].values)
     inside = (times >= segment.start - 1e-6) & (times <= segment.end + 1e-6)
     inside &= np.abs(times / tile_s - np.round(times / tile_s)) * tile_s < 0.5
@@ -73,7 +76,8 @@ def tiles(
         return None
 
     def llr(name: str) -> np.ndarray | None:
-        return netcdf.rows(maps[name], chosen) if name in maps else None
+        rows = netcdf.rows(maps[name], chosen) if name in maps else None
+        return None if rows is None or np.isnan(rows).all() else rows
 
     return times[chosen], llr("azimuth_llr"), llr("range_llr")
 

@@ -58,7 +58,7 @@ def segments(
 
     Returns
     -------
-    list of Segment in time order, each at least `shortest_min` long.
+    list of Segment in time order, each at least `shortest_min` long; none begins or ends where there is no data.
 
     Source: Trabattoni et al. 2023, section III.D, eqs (24)–(25); the first factor of eq. (24) reads P_α.
     """
@@ -77,9 +77,11 @@ def segments(
     radial = heard & (smooth["range"] > 0)
     phase = np.where(radial & (smooth["approaching"] > smooth["leaving"]), -1, 0)
     phase = np.where(radial & (smooth["approaching"] < smooth["leaving"]), 1, phase)
+    known = np.flatnonzero(presence.notna().any(axis=1).to_numpy())
     found: list[Segment] = []
     for lo, hi in _runs(heard[:settled]):
-        pieces = _split(time, phase, lo, hi, config)
+        inside = known[np.searchsorted(known, lo) : np.searchsorted(known, hi)]
+        pieces = _split(time, phase, int(inside[0]), int(inside[-1]) + 1, config) if inside.size else []
         found += pieces[:-1] if hi == settled and not ended else pieces
     return [segment for segment in found if segment.end - segment.start >= config.shortest_min * 60.0]
 

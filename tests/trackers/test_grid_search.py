@@ -1,5 +1,7 @@
 """Grid search: known courses come back, on the right side, where the ship was; nothing comes from nothing."""
 
+from unittest.mock import ANY
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -214,6 +216,19 @@ def test_range_alone_finds_the_passage_but_no_course():
     assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
     assert abs(found.motion.cpa_range_m) == pytest.approx(10_000.0, abs=400.0)
     assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
+
+
+def test_azimuths_without_data_are_no_azimuths():
+    """A horizontal that is dead throughout leaves maps of NaN: no course comes of them."""
+    truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(8))
+    maps["azimuth_llr"][:] = np.nan
+    (found,) = search(maps, SEGMENT, delay)
+    (alone,) = search(maps.drop_vars(["azimuth_llr", "azimuth_coverage", "azimuth"]), SEGMENT, delay)
+    assert found.row(1) == alone.row(1) | dict.fromkeys(
+        ["cpa_azimuth_deg", "course_deg", "course_std_deg"], ANY
+    )
+    assert np.isnan(found.row(1)["course_deg"]) and "course not observed" in found.method
 
 
 def test_missing_minutes_say_nothing():

@@ -37,6 +37,21 @@ def test_one_ship_is_one_segment_with_its_cpa():
     assert segment.cpa == pytest.approx(T0 + 60 * 600, abs=60 * 10)
 
 
+def test_silence_around_a_record_changes_nothing():
+    record = presence(count=200, ships=[(0, 100, 200)])
+    (segment,) = segments(record)
+    for before, after in ((200, 0), (0, 200), (30, 200)):
+        padded = record.reindex(T0 + 60.0 * np.arange(-before, len(record) + after))
+        assert segments(padded) == [segment]
+
+
+def test_a_gap_of_minutes_does_not_split_a_segment():
+    whole = presence(ships=[(400, 600, 800)])
+    cut = whole.copy()
+    cut.iloc[590:610] = np.nan
+    assert len(segments(cut)) == len(segments(whole)) == 1
+
+
 def test_a_segment_is_said_while_the_record_goes_on_once_nothing_can_change_it():
     ships = [(100, 250, 380), (380, 520, 640), (900, 1000, 1100)]
     table = presence(ships=ships)
