@@ -248,7 +248,7 @@ def calibrate(
 
     settings = commands.run_config(config, overrides, None, None)
     where = commands.read_station(station, code, start, depth_m=depth)
-    reference = commands.read_reference(ais, where, max_cpa_m=None)
+    reference = commands.read_reference(ais, where, max_cpa_m=None, quiet=quiet)
     with staged(out) as folder:
         with console.progress("calibrating", quiet) as progress:
             result = calibrate_waveforms(waveforms, where, reference, settings, start, end, progress)

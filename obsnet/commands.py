@@ -52,7 +52,7 @@ def track(
         station_file, code, start, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
-    reference = read_reference(ais, station) if ais else None
+    reference = read_reference(ais, station, quiet=quiet) if ais else None
     with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
         bar = stack.enter_context(ExitStack())
         progress = bar.enter_context(console.progress("reading and detecting", quiet))
@@ -240,11 +240,15 @@ def _calibrated(
     return fitted.apply(station), fitted.amplitudes
 
 
-def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3) -> list:
-    """Reference tracks of an AIS file, around the station."""
+def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3, quiet: bool = False) -> list:
+    """Reference tracks of an AIS file, around the station; says which rows were dropped, unless quiet."""
     from obsnet.ais import read, reference_tracks
 
-    return reference_tracks(read(path), station, max_cpa_m=max_cpa_m)
+    positions = read(path)
+    for complaint in positions.attrs["report"].complaint():
+        if not quiet:
+            console.say(f"note: {complaint}")
+    return reference_tracks(positions, station, max_cpa_m=max_cpa_m)
 
 
 def _summary(run: Run, out: Path) -> None:
@@ -255,8 +259,8 @@ def _summary(run: Run, out: Path) -> None:
     )
     for note in run.info.get("notes", []):
         console.say(f"note: {note}")
-    for warning in run.info["waveforms"].get("warnings", []):
-        console.say(f"note: {warning}")
+    for note in _waveform_notes(run.info["waveforms"]):
+        console.say(f"note: {note}")
     for number, found_track in enumerate(run.tracks, 1):
         row = found_track.row(number)
         seen = row["course_deg"] == row["course_deg"]
@@ -270,6 +274,16 @@ def _summary(run: Run, out: Path) -> None:
     if not run.tracks:
         console.say("no ship found" if "track" in run.info["seconds"] else "detections only")
     console.say(f"written to {out}")
+
+
+def _waveform_notes(report: dict[str, Any]) -> list[str]:
+    """What a reader of the tracks must know of the waveforms: what was mended, what could not be used."""
+    notes = list(report["notes"])
+    for seed_id, channel in report["channels"].items():
+        counts = {name: channel[name] for name in ("conflicting_overlaps", "dead_frames", "clipped_frames")}
+        found = [f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count]
+        notes += [f"{seed_id}: {', '.join(found)}"] if found else []
+    return notes
 
 
 def model_info(file: Path, as_json: bool = False) -> None:

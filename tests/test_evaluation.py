@@ -275,7 +275,10 @@ def test_table_and_json():
     lines = result.table().splitlines()
     assert lines[0].split() == ["azimuth", "range", "tracker,", "absolute", "errors"]
     assert lines[3].split()[:4] == ["1", "SHIP", "1", str(result.ships[0].azimuth_n)]
-    assert "1 of 2 ships matched, 1 missed (2), 0 false" in result.table()
+    assert "\n1 track: 1 of 2 ships matched, 1 missed (2), 0 false" in result.table()
+    assert "1 tracks" not in result.table()
+    both = evaluate(detections(azimuth), tracks(FIRST, SECOND), [ship(FIRST)], delay).table()
+    assert "\n2 tracks: 1 of 1 ship matched, 0 missed, 1 false (2)" in both
     assert max(map(len, lines)) <= 120
     plain = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert plain["ships"][1]["cpa_time_error_s"] is None and plain["missed"] == [2]
@@ -328,6 +331,28 @@ class TestFolder:
         assert (row.mmsi, row.track) == (7, 1)
         assert row.azimuth_smad_deg < 0.05 and row.range_smad_m < 1.0
         assert abs(row.cpa_time_error_s) < 1.0 and abs(row.cpa_distance_error_m) < 1.0
+
+    def test_bad_rows_of_ais_are_counted(self, folder):
+        assert not any("AIS" in note for note in evaluate_folder(folder, folder / "ais.csv").notes)
+        with (folder / "ais.csv").open("a") as file:
+            file.write("7,soon,54,-21\n7,2013-05-21T10:00:00Z,,\n")
+        found = evaluate_folder(folder, folder / "ais.csv")
+        assert "dropped: 1 no readable time, 1 no position" in found.table()
+
+    @pytest.mark.parametrize(
+        ("ship_type", "said"),
+        [
+            (None, "1 ship left out as no merchant (1 of unknown type)"),
+            ("30", "1 ship left out as no merchant (0 of unknown type)"),
+            ("70", ""),
+        ],
+    )
+    def test_ships_left_out_as_no_merchants_are_counted(self, folder, ship_type, said):
+        ais = pd.read_csv(folder / "ais.csv")
+        ais.assign(ship_type=ship_type).to_csv(folder / "ais.csv", index=False)
+        found = evaluate_folder(folder, folder / "ais.csv", merchant_only=True)
+        assert len(found.ships) == (0 if said else 1)
+        assert said in found.table() and ("left out" in found.table()) == bool(said)
 
     def test_a_run_without_ships_is_no_error(self, folder):
         header = (folder / "tracks.csv").read_text().splitlines()[0]

@@ -254,6 +254,23 @@ def test_a_file_cut_short_serves_as_far_as_it_goes(tracked, record, tmp_path):
     assert len(detections(out))
 
 
+def test_what_was_wrong_with_the_waveforms_is_said(obsnet, stream, record, tmp_path, unplotted):
+    dead, other = stream.copy(), stream.slice(START, START + 600).copy()
+    dead.select(channel="BH2")[0].data[:] = 0
+    for trace in other:
+        trace.data = trace.data[::-1].copy()
+    (dead + other).write(str(tmp_path / "w.mseed"), "MSEED")
+    with (tmp_path / "w.mseed").open("ab") as file:
+        file.write((record / "waveforms.mseed").read_bytes()[:300])
+    given = ("detect", tmp_path / "w.mseed", "--station", record / "station.xml", "--out", tmp_path / "out")
+    status, said, _ = obsnet(*given)
+    assert status == 0
+    found = [line for line in said if line.startswith("note:")]
+    assert any("cut or unreadable" in line for line in found)
+    assert any(re.search(r"BDH: \d+ conflicting overlaps", line) for line in found)
+    assert any(re.search(r"BH2: .*\d+ dead frames", line) for line in found)
+
+
 def test_times_with_an_offset_are_that_time(tracked, record):
     span = ("--start", "2013-05-21T13:00:00+02:00", "--end", "2013-05-21T11:20:00")
     times = detections(tracked(record / "waveforms.mseed", *span))["time"]

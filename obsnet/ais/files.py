@@ -53,6 +53,10 @@ class ReadReport:
             reasons and f"; dropped: {reasons}"
         )
 
+    def complaint(self) -> list[str]:
+        """One line if a row was dropped for another reason than its distance, else none."""
+        return [f"AIS file read as {self}"] if self.dropped.keys() - {"too far away"} else []
+
 
 def read(
     path: str | Path | Sequence[str | Path],

@@ -232,7 +232,7 @@ def reference_tracks(
             continue
         mmsi = int(ais["mmsi"].iloc[first])
         facts = _attributes(ais.iloc[part])
-        if merchant_only and not _is_merchant(facts.get("ship_type")):
+        if merchant_only and not is_merchant(facts.get("ship_type")):
             continue
         name = str(facts.pop("name", None) or mmsi)
         track = ReferenceTrack(
@@ -278,7 +278,8 @@ def _closest(time: np.ndarray, east: np.ndarray, north: np.ndarray) -> ClosestAp
     )
 
 
-def _is_merchant(ship_type: str | None) -> bool:
+def is_merchant(ship_type: str | None) -> bool:
+    """Whether an AIS type, as a number or in words, is that of a cargo ship or a tanker; an unknown one is not."""
     words = str(ship_type or "").lower()
     return words.startswith(("cargo", "tanker")) or (words.isdigit() and 70 <= int(words) < 90)
 

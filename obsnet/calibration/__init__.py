@@ -174,7 +174,7 @@ def calibrate_waveforms(
     Parameters
     ----------
     waveforms : obspy Stream, or path(s) of files, folders or an SDS archive.
-    station, tracks : as for `calibrate`.
+    station, tracks : as for `calibrate`; the metadata need not give an orientation.
     settings : RunConfig, optional
         Its sections spectra, azigram (band), cepstrogram (clutter filter), range (pairs) and ocean are used.
     starttime, endtime : part of the record to use.
@@ -191,6 +191,9 @@ def calibrate_waveforms(
             pairs=settings.range.pairs,
             clutter=settings.cepstrogram,
         )
+    stated = {channel.azimuth_deg for channel in station.horizontals}
+    if len(station.horizontals) == 2 and (None in stated or len(stated) == 1):
+        station = station.calibrated(orientation_deg=0.0)  # any will do to begin with
     source = open_waveforms(waveforms, station, starttime=starttime, endtime=endtime)
 
     def blocks() -> Iterator[xr.Dataset]:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from obsnet.ais import ReferenceTrack, read, reference_tracks
-from obsnet.ais.tracks import DelayFunction
+from obsnet.ais.tracks import DelayFunction, is_merchant
 from obsnet.config import build
 from obsnet.errors import ConfigError, LayoutError
 from obsnet.evaluation.detections import DetectionCriteria
 from obsnet.evaluation.score import DETECTIONS, TRACKS, evaluate
-from obsnet.evaluation.table import Evaluation
+from obsnet.evaluation.table import Evaluation, counted
 from obsnet.evaluation.tracks import utc
+from obsnet.layout import to_posix
 
 
 def evaluate_folder(
@@ -32,7 +34,7 @@ def evaluate_folder(
 
     Parameters
     ----------
-    max_range_m, merchant_only : as for `obsnet.ais.reference_tracks`.
+    max_range_m, merchant_only : as for `obsnet.ais.reference_tracks`; a note says how many ships the latter left out.
     max_cpa_m : ships that come no closer need not be found; a track of such a ship is not false.
 
     Raises
@@ -50,14 +52,36 @@ def evaluate_folder(
         raise LayoutError(
             f"{folder}/run.json does not describe a run of obsnet ({error}); run obsnet track again"
         ) from None
+    said: list[str] = []
     if not isinstance(ais, list):
         positions = read(ais, near=place, within_m=max_range_m + 400e3)
-        ais = reference_tracks(
-            positions, place, max_range_m=max_range_m, max_cpa_m=None, merchant_only=merchant_only
-        )
+        said += positions.attrs["report"].complaint()
+        ais = reference_tracks(positions, place, max_range_m=max_range_m, max_cpa_m=None)
+    if merchant_only:
+        merchants = [track for track in ais if is_merchant(track.attributes.get("ship_type"))]
+        said += _left_out([track for track in ais if track not in merchants], detections, max_cpa_m)
+        ais = merchants
     ambiguous = any("180°" in str(note) for note in notes)
     criteria = DetectionCriteria(azimuth_period_deg=180.0 if ambiguous else 360.0)
-    return evaluate(detections, tracks, ais, delay, criteria, expected_cpa_m=max_cpa_m)
+    found = evaluate(detections, tracks, ais, delay, criteria, expected_cpa_m=max_cpa_m)
+    return replace(found, notes=(*said, *found.notes))
+
+
+def _left_out(others: list[ReferenceTrack], detections: pd.DataFrame, max_cpa_m: float) -> list[str]:
+    """What to say of ships that are no merchants, or not known to be, and passed while the station recorded."""
+    times = to_posix(detections["time"].to_numpy("datetime64[ns]"))
+    about = [
+        track.attributes.get("ship_type")
+        for track in others
+        if times.size and track.endtime >= times.min() and track.starttime <= times.max()
+        if track.cpa().range_m <= max_cpa_m
+    ]
+    if not about:
+        return []
+    unknown = sum(kind in (None, "0") for kind in about)
+    return [
+        f"{counted(len(about), 'ship')} left out as no merchant ({unknown} of unknown type); a track of such a ship counts as false"
+    ]
 
 
 def read_run(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:

@@ -169,7 +169,7 @@ def _notes(
     notes = []
     if not ships:
         notes.append(
-            "no ship of the AIS file was about during the record: all detections and tracks count as false"
+            "no ship to compare with was about during the record: all detections and tracks count as false"
         )
     if not len(detections):
         notes.append("the run holds no minute")

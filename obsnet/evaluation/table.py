@@ -101,7 +101,7 @@ class Evaluation:
     def _rest(self) -> list[str]:
         matched = sum(row.track is not None for row in self.ships)
         lines = [
-            f"{self.tracks} tracks: {matched} of {len(self.ships)} ships matched, {len(self.missed)} missed"
+            f"{counted(self.tracks, 'track')}: {matched} of {counted(len(self.ships), 'ship')} matched, {len(self.missed)} missed"
             f"{_listed(self.missed)}, {len(self.false_tracks)} false{_listed(self.false_tracks)}"
         ]
         if matched and self.against_lines:
@@ -121,7 +121,7 @@ class Evaluation:
             if held["tracks"]:
                 lines.append(
                     f"{name}: truth in the 50 % region of {_percent(held['50_percent'])} "
-                    f"and in the 90 % region of {_percent(held['90_percent'])} of {held['tracks']} tracks"
+                    f"and in the 90 % region of {_percent(held['90_percent'])} of {counted(int(held['tracks']), 'track')}"
                 )
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
@@ -138,6 +138,15 @@ def _number(value: float, digits: int) -> str:
 
 def _percent(share: float) -> str:
     return "-" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def counted(number: int, thing: str) -> str:
+    """A number of things.
+
+    >>> counted(1, "track"), counted(0, "ship")
+    ('1 track', '0 ships')
+    """
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def _listed(numbers: tuple[int, ...]) -> str:

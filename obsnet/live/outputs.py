@@ -209,10 +209,12 @@ def metrics(status: dict[str, Any]) -> bytes:
                 "detector": status["detector"],
             }
             yield InfoMetricFamily("obsnet", "The station.", info)
+            models = InfoMetricFamily("obsnet_model", "A model in use.", labels=["name"])
             for name, digest in status["models"].items():
-                yield InfoMetricFamily(
-                    "obsnet_model", "A model in use.", {"name": name, "digest": str(digest)}
-                )
+                models.add_metric([name], {"digest": str(digest)})
+            yield models
+            if status.get("tracks") is not None:
+                yield CounterMetricFamily("obsnet_tracks", "Finished tracks.", float(status["tracks"]))
 
     registry = CollectorRegistry(auto_describe=False)
     registry.register(Collector())  # type: ignore[arg-type]
@@ -225,6 +227,5 @@ _GAUGES = (
     ("data_latency_seconds", "data_latency_s", "Time since the newest sample was taken."),
     ("minute_delay_seconds", "minute_delay_s", "From a packet's arrival to the row that it finished."),
     ("coverage_last_hour_ratio", "coverage_last_hour", "Share of the last hour's minutes that was heard."),
-    ("tracks_total", "tracks", "Finished tracks."),
     ("peak_memory_megabytes", "peak_memory_mb", "Largest resident memory so far."),
 )

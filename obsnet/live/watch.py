@@ -66,10 +66,33 @@ def watch_source(
         with stopping(live.stopping):
             found = open_source(source, station, config.live, live.resume, live.buffer.floor_ns, once)
             live.run(found, once)
+        if once:
+            for line in unused(live.status(), config.live.latency_s):
+                say(line)
     finally:
         for output in opened:
             output.close()
         live.close()
+
+
+def unused(status: dict[str, Any], latency_s: float) -> list[str]:
+    """What to say of data that were not used, or did not come, when a source has ended."""
+    fates = {fate: count for fate, count in status["packets"].items() if count}
+    lost = {fate: count for fate, count in fates.items() if fate not in ("used", "repeated")}
+    lines = []
+    if lost:
+        named = ", ".join(f"{count} {fate}" for fate, count in lost.items())
+        lines.append(f"note: {sum(lost.values())} of {sum(fates.values())} packets were not used: {named}")
+    if "late" in lost:
+        lines.append(
+            f"note: late packets came more than {latency_s:g} s after newer ones; sort them by time or raise --latency"
+        )
+    for what, unit in (("garbage", "bytes"), ("unreadable", "files")):
+        if status["source_counts"].get(what):
+            lines.append(f"note: {status['source_counts'][what]} {unit} could not be read")
+    if not fates.get("used"):
+        lines.append("nothing usable came")
+    return lines
 
 
 @contextmanager

@@ -44,6 +44,8 @@ def read(source: Any) -> Any:
             return obspy.read_inventory(BytesIO(content), format="STATIONXML")
         except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
             detail = " ".join(str(error).split())[:120] or type(error).__name__
+            if isinstance(error, TypeError) and "NoneType" in detail:
+                detail = "a latitude, longitude or elevation is missing or no number"
             if b"<FDSNStationXML" not in content and b":FDSNStationXML" not in content:
                 detail = "it has no FDSNStationXML element; give the station's StationXML"
             raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None

@@ -42,7 +42,7 @@ def frequency_response(response: Any, frequency: np.ndarray, kind: str, name: st
     Raises
     ------
     StationError
-        Units that are no pressure or motion, or a stage that has no linear response.
+        Units that are no pressure or motion, a stage that has no linear response, or a gain of 0.
     """
     frequency = np.asarray(frequency, float)
     if not described(response):
@@ -54,7 +54,12 @@ def frequency_response(response: Any, frequency: np.ndarray, kind: str, name: st
         total = np.full(frequency.size, _sensitivity(response))
         for stage in response.response_stages:
             total = total * _stage(stage, frequency, name)
-    return total * _unit_factor(unit, kind, frequency, name)
+    total = total * _unit_factor(unit, kind, frequency, name)
+    if (frequency > 0).any() and not (np.isfinite(total) & (total != 0))[frequency > 0].any():
+        raise StationError(
+            f"the response of {name} is 0 at every frequency; correct its gains in the StationXML"
+        )
+    return total
 
 
 def described(response: Any) -> bool:

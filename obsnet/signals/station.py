@@ -170,8 +170,10 @@ class Station:
         StationError
             Unreadable metadata, another station, no usable channel, no epoch at `time`, no depth.
 
-        Notes ----- The polarity of a pressure channel is the sign of its response; its dip is not used,
-        since instrument parks disagree on what it means.
+        Notes
+        -----
+        The polarity of a pressure channel is the sign of its response; its dip is not used, since instrument
+        parks disagree on what it means.
         """
         where = inventories.describe(source)
         station, network, name = inventories.find(inventories.read(source), code, where)

@@ -44,6 +44,18 @@ def passage(seed, cpa_m, polarity, directed=0.3):
     return simulation, station.calibrated(latitude=latitude, longitude=longitude)
 
 
+@pytest.mark.parametrize("azimuth", [None, 0.0])
+def test_an_orientation_that_the_metadata_do_not_give_is_found(azimuth):
+    simulation, _ = passage(6, -14e3, 1)
+    for channel in simulation.inventory[0][0]:
+        channel.azimuth = azimuth
+    station = Station.from_stationxml(simulation.inventory)
+    found = calibrate_waveforms(simulation.stream, station, reference_tracks(simulation.ais, station))
+    truth = simulation.scenario.recorder.orientation_deg
+    assert abs((found.orientation.azimuth_deg - truth + 180.0) % 360.0 - 180.0) < 2.0
+    assert share_on_the_ship(simulation, found.apply(station)) > 0.5
+
+
 @pytest.mark.parametrize(("seed", "cpa_m", "polarity"), [(3, 5000.0, -1), (6, -14e3, 1)])
 def test_orientation_polarity_and_place_are_recovered(seed, cpa_m, polarity, tmp_path):
     simulation, station = passage(seed, cpa_m, polarity)

@@ -133,7 +133,12 @@ def test_silence_is_trouble(monkeypatch):
 
 
 def test_metrics_carry_labels_and_digests(live):
-    status = live().status() | {"packets": {"used": 7, "late": 2}, "models": {"azimuth": "ab12"}}
+    models = {"azimuth": "ab12", "range": "cd34"}
+    status = live().status() | {"packets": {"used": 7, "late": 2}, "models": models, "tracks": 3}
     text = metrics(status).decode()
+    described = [line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")]
+    assert len(described) == len(set(described))
+    assert 'obsnet_model_info{digest="cd34",name="range"} 1.0' in text
+    assert "# TYPE obsnet_tracks_total counter\nobsnet_tracks_total 3.0" in text
     assert 'obsnet_packets_total{fate="late"} 2.0' in text
     assert 'obsnet_model_info{digest="ab12",name="azimuth"} 1.0' in text

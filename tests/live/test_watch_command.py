@@ -78,6 +78,24 @@ def test_standard_input_gives_what_track_gives(record, finished, tmp_path):
     assert differences(rows(tmp_path), rows(finished)) == []
 
 
+def test_what_was_not_used_is_said(record, tmp_path):
+    """A file that holds one channel after the other is late by its own length."""
+    with (record / "waveforms.mseed").open("rb") as waveforms:
+        given = ("-", "--station", record / "station.xml", "--out", tmp_path / "out", "--once")
+        said, errors = process(*given, stdin=waveforms).communicate(timeout=120)
+    assert errors == b""
+    assert b"packets were not used" in said and b"raise --latency" in said
+
+
+def test_nothing_usable_is_said(record, tmp_path):
+    (tmp_path / "junk").write_bytes(bytes(4000))
+    with (tmp_path / "junk").open("rb") as junk:
+        given = ("-", "--station", record / "station.xml", "--out", tmp_path / "out", "--once")
+        said, errors = process(*given, stdin=junk).communicate(timeout=120)
+    assert errors == b""
+    assert said.splitlines()[-1] == b"nothing usable came"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(record, tmp_path, number):
     source = tmp_path / "in"

@@ -46,6 +46,12 @@ def test_a_geophone_is_its_second_order_equation():
     np.testing.assert_allclose(got, 200.0 * shape / at20, rtol=1e-9)
 
 
+@pytest.mark.parametrize("gain", [0.0, np.nan])
+def test_a_gain_of_nothing_is_refused(gain):
+    with pytest.raises(StationError, match=r"response of YV\.X\.\.BHZ is 0 at every frequency"):
+        frequency_response(respond(geophone(gain)), FREQUENCY, "motion", "YV.X..BHZ")
+
+
 @pytest.mark.parametrize(
     ("units", "kind", "factor"),
     [

@@ -1,6 +1,7 @@
 """Station metadata: the right channels, directions, epochs and depth; one line for all that is wrong."""
 
 import math
+import re
 
 import numpy as np
 import obspy
@@ -156,6 +157,17 @@ def test_a_truncated_file_is_named(xml):
     path = xml()
     path.write_bytes(path.read_bytes()[:1500])
     with pytest.raises(StationError, match=r"station\.xml is not a StationXML that can be read"):
+        Station.from_stationxml(path)
+
+
+@pytest.mark.parametrize("value", ["NaN", ""])
+@pytest.mark.parametrize("place", ["Latitude", "Elevation"])
+def test_a_place_that_is_no_number_is_named(xml, place, value):
+    path = xml()
+    text, count = re.subn(rf"(<{place}[^>]*>)[^<]+(</{place}>)", rf"\g<1>{value}\g<2>", path.read_text())
+    assert count
+    path.write_text(text)
+    with pytest.raises(StationError, match="latitude, longitude or elevation is missing or no number"):
         Station.from_stationxml(path)
 
 
