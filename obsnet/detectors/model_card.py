@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -163,14 +164,19 @@ class ModelFile:
         return cls(path, content, digest, tuple(sorted(set(graph.operators))), card)
 
     def session(self, threads: int = 1) -> Any:
-        """An onnxruntime session: stated threads, no spinning, no arena.
+        """An onnxruntime session: stated threads, no spinning, no arena, no telemetry.
+
+        From 1.31 on, onnxruntime keeps a device's identity and sends what it does to its makers, unless told not to
+        before it is imported.
 
         Raises
         ------
         ModelError : onnxruntime refuses the model.
         """
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
         import onnxruntime
 
+        onnxruntime.disable_telemetry_events()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL

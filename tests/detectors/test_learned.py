@@ -1,8 +1,14 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
+import obsnet
 from obsnet.detectors.learned import LearnedAzimuthDetector, _spline
 from obsnet.detectors.model_card import MODELS, ModelFile, shipped
 from obsnet.errors import ModelError
@@ -85,6 +91,19 @@ def test_a_shipped_model_that_was_altered_is_refused(tmp_path, monkeypatch):
     target.unlink()
     with pytest.raises(ModelError, match="use --detector analytic"):
         LearnedAzimuthDetector()
+
+
+def test_a_session_keeps_no_identity_and_tells_nobody(tmp_path):
+    """onnxruntime's telemetry writes the device's identity, and what it has not sent yet, below the user's cache."""
+    code = "from obsnet.detectors.model_card import ModelFile, shipped; ModelFile.read(shipped('range')).session()"
+    paths = {
+        "XDG_CACHE_HOME": str(tmp_path),
+        "HOME": str(tmp_path),
+        "PYTHONPATH": str(Path(obsnet.__file__).parents[1]),
+    }
+    clean = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    subprocess.run([sys.executable, "-c", code], env=clean | paths, check=True)
+    assert [path for path in tmp_path.rglob("*") if "onnxruntime" in path.name] == []
 
 
 def test_any_cut_of_the_record_gives_the_same_maps(station):
