@@ -89,12 +89,14 @@ def parse_utc(text: str) -> int:
     return int(np.datetime64(parts["time"], "ns").astype(np.int64)) - offset_s * 1_000_000_000
 
 
-def iso(time: np.datetime64 | float) -> str:
-    """ISO 8601 UTC text ending in Z, to the second (tenths where they matter).
+def iso(time: np.datetime64 | float, milliseconds: bool = False) -> str:
+    """ISO 8601 UTC text ending in Z, to the second; to the millisecond where that matters, or always.
 
-    >>> iso(np.datetime64("2013-05-21T10:00:00"))
-    '2013-05-21T10:00:00Z'
+    Readers of whole columns take the format of the first time for that of all.
+
+    >>> iso(np.datetime64("2013-05-21T10:00:00")), iso(0.0, milliseconds=True)
+    ('2013-05-21T10:00:00Z', '1970-01-01T00:00:00.000Z')
     """
     stamp = from_posix(time) if isinstance(time, (int, float)) else np.asarray(time)
-    text = np.datetime_as_string(stamp.astype("datetime64[ms]"))
-    return str(text).removesuffix(".000") + "Z"
+    text = str(np.datetime_as_string(stamp.astype("datetime64[ms]")))
+    return (text if milliseconds else text.removesuffix(".000")) + "Z"

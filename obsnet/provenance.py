@@ -12,7 +12,7 @@ from typing import Any
 
 def versions() -> dict[str, Any]:
     """Versions of obsnet, of what it computes with, and of Python."""
-    names = ("numpy", "scipy", "numba", "xarray", "obspy")
+    names = ("numpy", "scipy", "numba", "xarray", "pandas", "pyproj", "obspy", "onnxruntime")
     return {
         "obsnet": version("obsnet"),
         "versions": {name: version(name) for name in names},

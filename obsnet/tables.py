@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from obsnet.kinematics import wrap180
 from obsnet.layout import iso
 from obsnet.signals.station import Station
 from obsnet.trackers.track import Track
@@ -53,8 +54,10 @@ def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
             continue
         times, east, north = found.positions(300.0)
         longitude, latitude = local(east, north, inverse=True)
+        # Across the antimeridian a line goes on beyond 180° rather than around the world.
+        longitude = station.longitude + wrap180(np.asarray(longitude) - station.longitude)
         properties = {key: None if value != value else value for key, value in found.row(number).items()}
-        properties["times"] = [iso(t) for t in times]
+        properties["times"] = [iso(t, milliseconds=True) for t in times]
         properties["method"] = found.method
         coordinates = [
             [round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)

@@ -13,6 +13,9 @@ from pyproj import Geod
 from threadpoolctl import threadpool_info
 
 from obsnet import Station, detect
+from obsnet.kinematics import StraightCourse
+from obsnet.tables import geojson
+from obsnet.trackers.track import Track
 
 from .conftest import HOURS, START
 
@@ -92,6 +95,7 @@ def test_geojson_is_lines_in_wgs84_with_times(finished, inventory):
     times = feature["properties"]["times"]
     assert len(times) == len(coordinates) >= 2
     assert all(UTC.fullmatch(time) for time in times)
+    assert len(pd.to_datetime(times)) == len(times)  # one format for all, or pandas refuses
     station = inventory[0][0]
     _, _, distance = Geod(ellps="WGS84").inv(
         [station.longitude] * len(times), [station.latitude] * len(times), *coordinates.T
@@ -102,6 +106,24 @@ def test_geojson_is_lines_in_wgs84_with_times(finished, inventory):
     assert along % 360 == pytest.approx(60, abs=2)
     seconds = obspy.UTCDateTime(times[-1]) - obspy.UTCDateTime(times[0])
     assert length / seconds == pytest.approx(8, abs=0.5)
+
+
+@pytest.mark.parametrize("longitude", [179.9, -179.9, 0.0])
+def test_a_line_across_the_antimeridian_does_not_go_around_the_world(longitude):
+    course = StraightCourse(START.timestamp, 5000.0, 90.0, 8.0)
+    track = Track(START.timestamp - 7200, START.timestamp + 7200, course, np.eye(4), 100.0)
+    (feature,) = geojson([track], Station("XX.SIM01", -20.0, longitude, 4000.0))["features"]
+    found = np.array(feature["geometry"]["coordinates"])[:, 0]
+    assert (np.abs(np.diff(found)) < 0.1).all()
+    assert np.abs(found - longitude).max() < 1.0
+
+
+def test_times_of_cpa_are_all_alike():
+    rows = [
+        Track(0.0, 7200.0, StraightCourse(at, 5000.0, 90.0, 8.0), np.eye(4), 100.0).row(1)
+        for at in (3600.0, 3600.5)
+    ]
+    assert [row["cpa_time"] for row in rows] == ["1970-01-01T01:00:00.000Z", "1970-01-01T01:00:00.500Z"]
 
 
 def test_maps_are_cf_netcdf(finished):
@@ -130,6 +152,7 @@ def test_run_json_says_how(finished):
         "station",
         "waveforms",
     } <= info.keys()
+    assert {"obspy", "onnxruntime"} <= info["versions"].keys()
     assert info["station"]["code"] == "XX.SIM01"
     assert info["config"]["detector"] == "learned"
     assert info["seconds"].keys() >= {"spectra", "detect", "track"}

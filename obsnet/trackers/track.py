@@ -56,7 +56,7 @@ class Track:
             "track": number,
             "start": iso(self.start),
             "end": iso(self.end),
-            "cpa_time": iso(self.motion.cpa_time),
+            "cpa_time": iso(self.motion.cpa_time, milliseconds=True),
             "cpa_distance_m": abs(self.motion.cpa_range_m),
             "cpa_azimuth_deg": self.motion.cpa_azimuth_deg,
             "course_deg": self.motion.course_deg % 360.0,
