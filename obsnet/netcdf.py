@@ -14,6 +14,9 @@ import xarray as xr
 from obsnet.errors import OutputError
 from obsnet.layout import to_posix
 
+UNITS = {"frequency": "Hz", "spectrogram_frequency": "Hz", "quefrency": "s"}
+"""Units of the coordinates that are not given with them."""
+
 PACKED = {"range_llr": 0.05}
 """Variables stored as 16-bit integers, and their resolution (CF `scale_factor`)."""
 
@@ -108,7 +111,8 @@ class TimeWriter:
             file.dimensions[name] = coordinate.size
             variable = file.create_variable(str(name), (name,), "f8")
             variable[:] = coordinate.values
-            variable.attrs.update(coordinate.attrs)
+            units = {"units": UNITS[str(name)]} if name in UNITS else {}
+            variable.attrs.update(units | coordinate.attrs)
         for name, values in _real(block).items():
             values = values.transpose("time", ...)
             packed = name in PACKED

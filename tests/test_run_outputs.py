@@ -139,6 +139,8 @@ def test_maps_are_cf_netcdf(finished):
 def test_the_spectrogram_has_units(finished):
     with xr.open_dataset(finished / "features.nc") as features:
         assert features["power"].attrs["units"] == "Pa2"
+        axes = {name: coord.attrs["units"] for name, coord in features.coords.items() if name != "time"}
+    assert axes == {"spectrogram_frequency": "Hz", "frequency": "Hz", "quefrency": "s"}
 
 
 def test_run_json_says_how(finished):
