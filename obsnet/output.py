@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from obsnet.errors import OutputError
+
+_YOUNG_S = 60.0
 
 
 def prepare_folder(folder: str | Path) -> Path:
@@ -48,18 +52,35 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
     made = [path for path in (Path(folder), *Path(folder).parents) if not path.exists()]
     try:
         target = prepare_folder(folder)
+        _sweep(target)
         stage = Path(tempfile.mkdtemp(prefix=".unfinished-", suffix=".tmp", dir=target))
+        held = os.open(stage, os.O_RDONLY)
         try:
+            fcntl.flock(held, fcntl.LOCK_SH)
             yield stage
             _move(stage, target, leftovers)
         except OutputError as error:
             raise OutputError(str(error).replace(str(stage), str(target))) from None
         finally:
+            os.close(held)
             shutil.rmtree(stage, ignore_errors=True)
     finally:
         for path in made:
             with suppress(OSError):  # what holds files stays
                 path.rmdir()
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what a run that was killed has left: its lock went with it. What is young may not be locked yet."""
+    for path in folder.glob(".unfinished-*.tmp"):
+        with suppress(OSError):
+            held = os.open(path, os.O_RDONLY)
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if time.time() - path.stat().st_mtime > _YOUNG_S:
+                    shutil.rmtree(path, ignore_errors=True)
+            finally:
+                os.close(held)
 
 
 def _move(stage: Path, folder: Path, leftovers: tuple[str, ...]) -> None:
