@@ -207,7 +207,7 @@ def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: R
     raise WaveformError(
         f"no minute of {source.station.code} from {begin} to {end} has usable data ("
         + "; ".join([*why, *source.report.notes])
-        + f"); give at least {2 * config.azimuth.window_s:g} s of working channels"
+        + f"); give at least {2 * config.azimuth.window_s:g} s of working channels, and leave out of the StationXML what never works"
     )
 
 

@@ -97,6 +97,26 @@ def test_a_record_in_which_nothing_works(refused, stream, tmp_path):
     assert "BH1: 0 s of gaps, 70" in line
 
 
+def test_a_hydrophone_that_never_works_may_be_left_out(
+    refused, obsnet, stream, inventory, tmp_path, unplotted
+):
+    for trace in (dead := stream.copy()).select(channel="BDH"):
+        trace.data[:] = 0
+    dead.write(str(tmp_path / "dead.mseed"), "MSEED")
+    assert "leave out of the StationXML what never works" in refused(waveforms=tmp_path / "dead.mseed")
+    keep("BH1", "BH2", "BHZ")((without := copy.deepcopy(inventory))[0])
+    without.write(str(tmp_path / "s.xml"), "STATIONXML")
+    given = (
+        "detect",
+        tmp_path / "dead.mseed",
+        "--station",
+        tmp_path / "s.xml",
+        "--out",
+        tmp_path / "azimuths",
+    )
+    assert obsnet(*given, "--quiet") == (0, [], [])
+
+
 @pytest.mark.parametrize(
     ("content", "found"),
     [
