@@ -85,7 +85,10 @@ def add_variant(name: str, sensor: str, model: str) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run: generators by name, kinds, numbers of test and validation seeds of each, hours of a record, rows."""
+    """What to run: generators by name, kinds, numbers of test and validation seeds of each, hours of a record, rows.
+
+    Validation is of `validation_kinds`, of the same kinds as the test where it is empty.
+    """
 
     generators: Mapping[str, Maker]
     kinds: tuple[str, ...] = KINDS
@@ -94,13 +97,15 @@ class Plan:
     hours: float = 4.0
     rows: tuple[str, ...] = tuple(ROWS)
     first_seed: int = 0
+    validation_kinds: tuple[str, ...] = ()
 
     def cases(self, validation: bool) -> list[tuple[str, str, int]]:
         """Generator, kind and seed of every record."""
         first, count = (
             (VALIDATION_SEED, self.validation_seeds) if validation else (self.first_seed, self.seeds)
         )
-        return [(g, k, first + i) for g in self.generators for i in range(count) for k in self.kinds]
+        kinds = (self.validation_kinds or self.kinds) if validation else self.kinds
+        return [(g, k, first + i) for g in self.generators for i in range(count) for k in kinds]
 
 
 def run(plan: Plan, folder: str | Path, progress: Progress | None = None) -> None:

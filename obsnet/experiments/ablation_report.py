@@ -50,6 +50,7 @@ def main(makers: Mapping[str, Maker], description: str | None = None) -> None:
         metavar=("NAME", "SENSOR", "MODEL"),
         help="another model's row",
     )
+    # Whatever kinds are tested, thresholds are of all.
     for name, choices in (("kinds", KINDS), ("rows", ROWS), ("generators", makers)):
         parser.add_argument(f"--{name}", nargs="+", choices=list(choices), default=list(choices))
     given = parser.parse_args()
@@ -58,7 +59,7 @@ def main(makers: Mapping[str, Maker], description: str | None = None) -> None:
         given.rows.append(variant[0])
     chosen = {name: makers[name] for name in given.generators}
     numbers = given.seeds, given.validation_seeds, given.hours
-    plan = Plan(chosen, tuple(given.kinds), *numbers, tuple(given.rows))
+    plan = Plan(chosen, tuple(given.kinds), *numbers, tuple(given.rows), validation_kinds=KINDS)
     if not given.report_only:
         run(plan, given.folder, lambda done, total: print(f"{done:.0f} of {total:.0f} records", flush=True))
     print(text(write(plan, given.folder, given.out)))

@@ -1,5 +1,7 @@
 """The ablation: minutes against the truth, thresholds, recalibration, and studies that go on where they stopped."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -121,6 +123,14 @@ def test_the_twin_makes_every_kind(kind):
 def test_an_unknown_kind_is_refused():
     with pytest.raises(ConfigError, match="no kind of record 'odd'"):
         twin_scenario("odd", 0, 1.0)
+
+
+def test_thresholds_may_be_of_more_kinds_than_are_tested():
+    plan = Plan({"twin": write_twin}, ("faint",), 2, 1)
+    assert plan.cases(validation=True) == [("twin", "faint", 1000)]
+    plan = replace(plan, validation_kinds=KINDS)
+    assert [kind for _, kind, _ in plan.cases(validation=True)] == list(KINDS)
+    assert plan.cases(validation=False) == [("twin", "faint", 0), ("twin", "faint", 1)]
 
 
 @pytest.mark.slow
