@@ -142,7 +142,7 @@ def _case(plan: Plan, folder: Path, case: tuple[str, str, int], wanted: list[str
         except ModelError:
             continue
         _keep(place, name, made, seconds)
-    if "analytic" in runs and seed >= VALIDATION_SEED:
+    if "analytic" in runs and seed >= VALIDATION_SEED and not (place / SAMPLES).exists():
         truth = pd.read_csv(place / "truth.csv")
         held: dict[str, Any] = {**samples(runs["analytic"][0].maps, truth)}
         np.savez(place / SAMPLES, **held)
