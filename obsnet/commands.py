@@ -279,6 +279,12 @@ def _summary(run: Run, out: Path) -> None:
 def _waveform_notes(report: dict[str, Any]) -> list[str]:
     """What a reader of the tracks must know of the waveforms: what was mended, what could not be used."""
     notes = list(report["notes"])
+    for left, kind in ((report["ignored"], "files"), (report["left_aside"], "channels")):
+        named = [
+            f"{Path(name).name}{':' if kind == 'files' else ''} {reason}" for name, reason in left.items()
+        ]
+        more = [f"{len(named) - 4} more {kind} left aside (all in run.json)"] if len(named) > 5 else []
+        notes += named[: 4 if more else 5] + more
     for seed_id, channel in report["channels"].items():
         counts = {name: channel[name] for name in ("conflicting_overlaps", "dead_frames", "clipped_frames")}
         found = [f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count]

@@ -326,6 +326,7 @@ def test_a_place_that_cannot_be_written(said, record, tmp_path):
         (["reproduce", "table1", "--detector", "odd"], "detector must be one of analytic"),
         (["reproduce", "tkbd", "--runs", "0"], "--runs"),
         (["reproduce", "tkbd", "--seed", "-1"], "seed must be a whole number of at least 0"),
+        (["bench", "station", "--detector", "odd"], "obsnet: error: detector must be one of learned"),
         (["plot", ".", "--figure", "4"], "no figure 4; choose one of 3, 5, 6, 7, 8"),
         (["plot", "nowhere"], "is not a folder of `obsnet track`"),
         (["evaluate", "nowhere", "--ais", "none.csv"], "nowhere is not a folder"),

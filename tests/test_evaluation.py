@@ -393,6 +393,12 @@ class TestFolder:
             evaluate_folder(folder, folder / "ais.csv")
         assert "\n" not in str(caught.value)
 
+    @pytest.mark.parametrize("limit", ["max_cpa_m", "max_range_m"])
+    @pytest.mark.parametrize("value", [-5e3, 0.0, np.nan])
+    def test_distances_are_above_zero(self, folder, limit, value):
+        with pytest.raises(ConfigError, match="distances above 0"):
+            evaluate_folder(folder, folder / "ais.csv", **{limit: value})
+
     def test_not_a_folder(self, tmp_path):
         with pytest.raises(LayoutError, match="is not a folder"):
             evaluate_folder(tmp_path / "none", tmp_path)

@@ -284,6 +284,9 @@ def test_what_was_wrong_with_the_waveforms_is_said(obsnet, stream, record, tmp_p
     dead.select(channel="BH2")[0].data[:] = 0
     for trace in other:
         trace.data = trace.data[::-1].copy()
+    for i in range(7):
+        (stray := stream.select(channel="BDH").slice(START, START + 60).copy())[0].stats.station = f"OTH{i}"
+        dead += stray
     (dead + other).write(str(tmp_path / "w.mseed"), "MSEED")
     with (tmp_path / "w.mseed").open("ab") as file:
         file.write((record / "waveforms.mseed").read_bytes()[:300])
@@ -292,6 +295,8 @@ def test_what_was_wrong_with_the_waveforms_is_said(obsnet, stream, record, tmp_p
     assert status == 0
     found = [line for line in said if line.startswith("note:")]
     assert any("cut or unreadable" in line for line in found)
+    assert any(line == "note: XX.OTH0.00.BDH not described for XX.SIM01" for line in found)
+    assert any(line.startswith("note: 3 more channels left aside") for line in found)
     assert any(re.search(r"BDH: \d+ conflicting overlaps", line) for line in found)
     assert any(re.search(r"BH2: .*\d+ dead frames", line) for line in found)
 

@@ -40,8 +40,12 @@ def evaluate_folder(
     Raises
     ------
     LayoutError
-        The folder is not one of a run. AISError: the AIS file cannot serve.
+        The folder is not one of a run. AISError: the AIS file cannot serve. ConfigError: a distance is not above 0.
     """
+    if not (max_range_m > 0 and max_cpa_m > 0):
+        raise ConfigError(
+            f"ships are followed and expected to distances above 0, found {max_range_m / 1e3:g} km and {max_cpa_m / 1e3:g} km"
+        )
     detections, tracks, info = read_run(folder)
     try:
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}

@@ -70,8 +70,9 @@ def station_cost(detector: str | None = None) -> StationCost:
 
     Raises
     ------
-    OutputError : a process failed.
+    ConfigError : there is no such detector. OutputError : a process failed.
     """
+    build(WatchConfig, {} if detector is None else {"detector": detector})
     with tempfile.TemporaryDirectory(prefix="obsnet-bench-") as folder:
         starts = [_cold_start(Path(folder) / f"start{i}", detector) for i in range(_STARTS)]
         told = _python("-m", "obsnet.live.bench", str(Path(folder) / "run"), detector or "")
