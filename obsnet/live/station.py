@@ -324,7 +324,9 @@ class LiveStation:
             self._lasting(lambda s=segment, t=tracks: self.ships.say(s, t), patient)  # type: ignore[misc]
             self._look()
             if tracks:
-                self._say(f"{len(tracks)} track(s) from {iso(segment.start)} to {iso(segment.end)}")
+                self._say(
+                    f"{len(tracks)} track{'s' * (len(tracks) != 1)} from {iso(segment.start)} to {iso(segment.end)}"
+                )
             try:
                 self.files.write_tracks()
             except OutputError as error:
