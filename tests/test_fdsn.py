@@ -247,6 +247,33 @@ def test_obsnet_reads_what_was_fetched(centre, fast, tmp_path):
     assert source.begin_ns == fast.stats.starttime.ns
 
 
+def test_what_was_described_before_stays_described(centre, tmp_path):
+    def described():
+        found = obspy.read_inventory(str(tmp_path / "station.xml"))
+        return sorted({f"{sta.code}.{channel.code}" for net in found for sta in net for channel in sta})
+
+    get(centre, tmp_path, end=DAY + 7200, channels="BDH")
+    get(centre, tmp_path, end=DAY + 7200, channels=("BH?",))
+    assert described() == ["RR03.BDH", "RR03.BH1", "RR03.BHZ"]
+    fetch("YV.RR04", DAY, DAY + 7200, tmp_path, base_url=centre.url, retry=QUICK)
+    assert described() == ["RR03.BDH", "RR03.BH1", "RR03.BHZ", "RR04.BDH"]
+    station = ObsnetStation.from_stationxml(tmp_path / "station.xml", "YV.RR03")
+    assert {channel.code for channel in station.epochs} == set(CHANNELS)
+    before = (tmp_path / "station.xml").read_bytes()
+    fetch("YV.RR04", DAY, DAY + 7200, tmp_path, base_url=centre.url, retry=QUICK)
+    again = obspy.read_inventory(io.BytesIO(before))
+    assert described() == sorted({f"{s.code}.{c.code}" for n in again for s in n for c in s})
+
+
+def test_the_command_says_what_it_fetched(centre, obsnet, tmp_path):
+    span = ("--start", str(DAY), "--end", str(DAY + 7200), "--out", tmp_path / "out")
+    status, said, errors = obsnet(
+        "fetch", "YV.RR03", *span, "--base-url", centre.url, "--channels", "BDH,BH1"
+    )
+    assert (status, errors) == (0, [])
+    assert said[-1].startswith("YV.RR03 (BDH, BH1): 2 channel-days fetched")
+
+
 def test_a_second_run_asks_for_nothing(centre, tmp_path):
     get(centre, tmp_path)
     before = len(centre.asked)

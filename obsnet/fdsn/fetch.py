@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,7 +65,7 @@ def fetch(
     out : path
         Folder: ``station.xml``, ``fetch.json`` (the manifest) and an SDS archive. Run again, it fetches
         what is not there, what was incomplete, and days that had ended less than a day before they were
-        asked for.
+        asked for. Other stations, channels and epochs that ``station.xml`` describes stay in it.
     base_url : str, optional
         Data centre, by obspy's name (``RESIF``) or address; EarthScope by default.
     channels : str or tuple of str
@@ -95,7 +96,7 @@ def fetch(
     source = DataCentre(base_url or DEFAULT_URL, retry, timeout_s)
     archive = Archive(Path(out))
     text = source.station_xml(network, station, location, ",".join(p.strip() for p in patterns), start, end)
-    archive.write("station.xml", text)
+    archive.write("station.xml", _joined(text, archive.folder / "station.xml", source.url))
     days = list(_days(read_stationxml(text, source.url), network, station, start, end))
     report = FetchReport(network_station, archive.folder, list(dict.fromkeys(day.channel for day in days)))
     for done, day in enumerate(days):
@@ -113,6 +114,35 @@ def fetch(
     if progress is not None:
         progress(len(days), len(days))
     return report
+
+
+def _joined(text: bytes, path: Path, url: str) -> bytes:
+    """Metadata with those of the stations, channels and epochs that an earlier `fetch` into the folder has described."""
+    if not path.is_file():
+        return text
+    whole, before = read_stationxml(text, url), read_stationxml(path.read_bytes(), str(path))
+    known = set(_epochs(whole))
+    for network in before:
+        for station in network:
+            station.channels = [c for c in station if _key(network, station, c) not in known]
+        network.stations = [station for station in network if station.channels]
+    whole.networks += [network for network in before if network.stations]
+    if set(_epochs(whole)) == known:
+        return text
+    joined = io.BytesIO()
+    whole.write(joined, format="STATIONXML")
+    return joined.getvalue()
+
+
+def _epochs(inventory: obspy.Inventory) -> Iterator[tuple[str, ...]]:
+    for network in inventory:
+        for station in network:
+            for channel in station:
+                yield _key(network, station, channel)
+
+
+def _key(network: Any, station: Any, channel: Any) -> tuple[str, ...]:
+    return network.code, station.code, channel.location_code, channel.code, str(channel.start_date)
 
 
 def _split(network_station: str) -> tuple[str, str]:
