@@ -85,6 +85,15 @@ def say(text: str) -> None:
         raise OutputError(f"cannot write to standard output: {error.strerror}") from None
 
 
+def counted(number: int, thing: str) -> str:
+    """A number of things.
+
+    >>> counted(1, "track"), counted(0, "ship")
+    ('1 track', '0 ships')
+    """
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
 def flush() -> None:
     """Send what standard output still holds; `OutputError` where it cannot take it."""
     try:

@@ -17,6 +17,7 @@ from obsnet.archive.day import DayTask, detect_day, one_line
 from obsnet.archive.ledger import Day, Ledger
 from obsnet.archive.tracks import TracksTask, find_day_tracks, forget, tracks_tasks
 from obsnet.archive.workers import Task, Workers, dask_workers, local_workers
+from obsnet.console import counted
 from obsnet.errors import ConfigError, StationError, WaveformError
 from obsnet.output import write_text
 from obsnet.pipeline import RunConfig
@@ -53,13 +54,13 @@ class Report:
         """What to tell the user."""
         counts = self.rows["status"].value_counts()
         of_each = ", ".join(f"{counts.get(name, 0)} {name}" for name in ("done", "no data", "failed"))
-        said = [f"{len(self.rows)} station-days: {of_each}; {self.computed} computed now"]
+        said = [f"{counted(len(self.rows), 'station-day')}: {of_each}; {self.computed} computed now"]
         said += [
             f"failed: {row.station} {row.date}: {row.error}" for row in self.failed.head(20).itertuples()
         ]
         if len(self.failed) > 20:
             said.append(f"… and {len(self.failed) - 20} more in report.csv")
-        return [*said, f"{int(self.rows['tracks'].sum())} tracks; written to {self.folder}"]
+        return [*said, f"{counted(int(self.rows['tracks'].sum()), 'track')}; written to {self.folder}"]
 
 
 def archive(

@@ -12,10 +12,11 @@ import pandas as pd
 from obsnet.ais import ReferenceTrack, read, reference_tracks
 from obsnet.ais.tracks import DelayFunction, is_merchant
 from obsnet.config import build
+from obsnet.console import counted
 from obsnet.errors import ConfigError, LayoutError
 from obsnet.evaluation.detections import DetectionCriteria
 from obsnet.evaluation.score import DETECTIONS, TRACKS, evaluate
-from obsnet.evaluation.table import Evaluation, counted
+from obsnet.evaluation.table import Evaluation
 from obsnet.evaluation.tracks import utc
 from obsnet.layout import to_posix
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from obsnet.console import counted
+
 
 @dataclass(frozen=True)
 class ShipScore:
@@ -138,15 +140,6 @@ def _number(value: float, digits: int) -> str:
 
 def _percent(share: float) -> str:
     return "-" if math.isnan(share) else f"{100 * share:.0f} %"
-
-
-def counted(number: int, thing: str) -> str:
-    """A number of things.
-
-    >>> counted(1, "track"), counted(0, "ship")
-    ('1 track', '0 ships')
-    """
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def _listed(numbers: tuple[int, ...]) -> str:

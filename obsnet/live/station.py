@@ -20,6 +20,7 @@ import pandas as pd
 import obsnet
 from obsnet import strips
 from obsnet.config import to_dict
+from obsnet.console import counted
 from obsnet.errors import ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.live.buffer import WaveformBuffer
@@ -324,9 +325,7 @@ class LiveStation:
             self._lasting(lambda s=segment, t=tracks: self.ships.say(s, t), patient)  # type: ignore[misc]
             self._look()
             if tracks:
-                self._say(
-                    f"{len(tracks)} track{'s' * (len(tracks) != 1)} from {iso(segment.start)} to {iso(segment.end)}"
-                )
+                self._say(f"{counted(len(tracks), 'track')} from {iso(segment.start)} to {iso(segment.end)}")
             try:
                 self.files.write_tracks()
             except OutputError as error:
