@@ -1,20 +1,19 @@
-"""Probabilistic focalization, figures 2 and 3 of Watkins et al., on simulated delays.
+"""Probabilistic focalization, figures 2 and 3 of Watkins et al., on simulated passages.
 
-Two passages like the paper's: a boat within 500 m in 65 m of water, a cargo ship within 3 km in 73 m. Every
-3 s a scan of unlabelled delays comes from one moving receiver; each of the paper's three parameter sets
-filters delays that were simulated with its own rates of detection and false alarms. The paper filters one
-recording with all three sets; it gives no courses and no numbers but its figures.
+Two passages like the paper's: a boat within 500 m in 65 m of water, a cargo ship within 3 km in 73 m, with one
+moving receiver. The paper filters a recording of each with three parameter sets, whose probabilities of detection
+and false alarms are set by hand, and says that its sections are those where most is heard. `kraken` and `marfret`
+do the same with simulated sound: every 3 s, delays are detected in its cepstrogram; every run has its own sound.
 
-What the listed rates of the boat's passage tell about its range is so little that no filter can settle
-within seconds (`information_nats`), which the paper's recording evidently allowed. A third passage,
-`kraken_clear`, is the boat's with each pair detected every other scan, filtered with the listed sets as they
-are.
+`kraken_listed` and `marfret_listed` take the parameter sets at their word: unlabelled delays are drawn with just
+these probabilities. Such scans tell so little (`information_nats`) that even a filter told which delay belongs to
+which pair (`ToldFilter`) waits for the first of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,15 +23,19 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from obsnet.errors import ConfigError
-from obsnet.experiments import montecarlo
+from obsnet.experiments import montecarlo, passage_sound
+from obsnet.experiments.passage_sound import Sound
 from obsnet.kinematics import StraightCourse
-from obsnet.trackers.focalization import FocalizationConfig, FocalizationFilter
+from obsnet.trackers.focalization import DEPTH, RANGE, FocalizationConfig, FocalizationFilter
 from obsnet.trackers.tdoa_association import ImageModel
 
 SCAN_S = 3.0
 SOUND_SPEED_MPS = 1508.0
 MAX_RANGE_M = 5000.0
 MAX_TDOA_S = 0.1
+MIN_DETECTED_S = 0.001
+"""Delays below are not looked for in a cepstrogram: the source's own spectrum lies there."""
+
 TDOA_STD_S = 5e-4
 WARM_UP_S = 30.0
 SETTLED_SHARE = 0.1
@@ -58,7 +61,7 @@ class Scenario:
     along_m : m, place along the course where the passage begins and ends, 0 at CPA.
     receiver_depth_m : m, at the beginning and at the end, linear between.
     settings : the paper's parameter sets.
-    detected : probability with which each pair is detected in truth; each setting's own where it is None.
+    sound : what is recorded, to detect delays in; where None, delays are drawn at each setting's rates.
     """
 
     water_depth_m: float
@@ -67,7 +70,7 @@ class Scenario:
     along_m: tuple[float, float]
     receiver_depth_m: tuple[float, float]
     settings: dict[str, Setting]
-    detected: float | None = None
+    sound: Sound | None = None
 
     @property
     def time_s(self) -> np.ndarray:
@@ -93,17 +96,35 @@ class Scenario:
         at = zip(self.range_m, self.receiver_m, strict=True)
         return np.concatenate([model.tdoas(np.array([r]), np.zeros(1), h) for r, h in at])
 
-    def measurements(self, setting: Setting, rng: np.random.Generator) -> list[np.ndarray]:
-        """Simulated scans of one run, delays [s] in random order."""
+    def heard(self, setting: Setting, rng: np.random.Generator) -> np.ndarray:
+        """Simulated delays [s] of one run at the setting's rates, dims (scan, pair), NaN where missed."""
         delays = self.delays()
-        heard = delays + TDOA_STD_S * rng.standard_normal(delays.shape)
-        odds = setting.detection_probability if self.detected is None else self.detected
-        detected = rng.random(delays.shape) < np.broadcast_to(odds, delays.shape)
-        scans = []
-        for values, keep in zip(heard, detected, strict=True):
-            false = rng.uniform(0.0, MAX_TDOA_S, rng.poisson(setting.false_alarms))
-            scans.append(rng.permutation(np.concatenate([values[keep], false])))
-        return scans
+        noisy = delays + TDOA_STD_S * rng.standard_normal(delays.shape)
+        return np.where(rng.random(delays.shape) < setting.detection_probability, noisy, np.nan)
+
+    def recorded(self, seed: int) -> list[np.ndarray | None]:
+        """Delays detected in the simulated sound of one run [s], scan by scan; None where nothing was recorded."""
+        if self.sound is None:
+            raise ConfigError("this passage has no sound to detect delays in; draw them with `heard`")
+        pressure = passage_sound.record(
+            self.time_s,
+            self.range_m,
+            self.receiver_m,
+            self.water_depth_m,
+            SOUND_SPEED_MPS,
+            self.sound,
+            (seed,),
+        )
+        return passage_sound.detect(pressure, self.time_s, self.sound, (MIN_DETECTED_S, MAX_TDOA_S))
+
+
+def mixed(heard: np.ndarray, false_alarms: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Scans of unlabelled delays [s] in random order: those heard, dims (scan, pair), and false ones."""
+    scans = []
+    for values in heard:
+        false = rng.uniform(0.0, MAX_TDOA_S, rng.poisson(false_alarms))
+        scans.append(rng.permutation(np.concatenate([values[np.isfinite(values)], false])))
+    return scans
 
 
 def _settings(false_alarms: float, *probabilities: tuple[float, ...]) -> dict[str, Setting]:
@@ -115,14 +136,21 @@ def _settings(false_alarms: float, *probabilities: tuple[float, ...]) -> dict[st
 
 KRAKEN = _settings(4.0, (0.12, 0.08, 0.06), (0.15, 0.15, 0.15), (0.1, 0.1, 0.1))
 MARFRET = _settings(1.0, (0.42, 0.35, 0.3), (0.35, 0.35, 0.35), (0.25, 0.25, 0.25))
+KRAKEN_SOUND = Sound(source_level_db=115.0, source_depth_m=1.0)
+MARFRET_SOUND = Sound(source_level_db=131.0, source_depth_m=4.0)
+"""Level of the mean merchant ship at 1 kHz, Wales and Heitmeyer 2002, doi:10.1121/1.1427355."""
+
+_KRAKEN = Scenario(65.0, 100.0, 2.85, (-490.0, 490.0), (40.0, 7.0), KRAKEN)
+_MARFRET = Scenario(73.0, 500.0, 6.4, (-866.0, 2958.0), (30.0, 7.0), MARFRET)
 SCENARIOS = {
-    "kraken": Scenario(65.0, 100.0, 2.85, (-490.0, 490.0), (40.0, 7.0), KRAKEN),
-    "marfret": Scenario(73.0, 500.0, 6.4, (-866.0, 2958.0), (30.0, 7.0), MARFRET),
-    "kraken_clear": Scenario(65.0, 100.0, 2.85, (-490.0, 490.0), (40.0, 7.0), KRAKEN, detected=0.5),
+    "kraken": replace(_KRAKEN, sound=KRAKEN_SOUND),
+    "marfret": replace(_MARFRET, sound=MARFRET_SOUND),
+    "kraken_listed": _KRAKEN,
+    "marfret_listed": _MARFRET,
 }
 
 
-def filter_config(setting: Setting, particles: int, seed: int) -> FocalizationConfig:
+def filter_config(setting: Setting, particles: int, seed: int, min_tdoa_s: float = 0.0) -> FocalizationConfig:
     """The paper's filter: no births, no existence; driving noise of variance 0.05 m²/s⁴ in range."""
     return FocalizationConfig(
         detection_probability=setting.detection_probability,
@@ -130,7 +158,7 @@ def filter_config(setting: Setting, particles: int, seed: int) -> FocalizationCo
         false_alarms=setting.false_alarms,
         false_alarm_memory_s=np.inf,
         false_alarm_resolution_s=0.0,
-        min_tdoa_s=0.0,
+        min_tdoa_s=min_tdoa_s,
         max_tdoa_s=MAX_TDOA_S,
         max_range_m=MAX_RANGE_M,
         range_prior="uniform",
@@ -168,36 +196,75 @@ def reproduce(
     outcomes = montecarlo.run(trial, runs, seed, jobs=jobs, progress=progress)
     tracks = {
         name: {
-            setting: Tracks(
-                np.array([outcome[name][setting][0] for outcome in outcomes]),
-                np.array([outcome[name][setting][1] for outcome in outcomes]),
-            )
-            for setting in SCENARIOS[name].settings
+            label: Tracks(*(np.array(column) for column in zip(*rows, strict=True)))
+            for label in SCENARIOS[name].settings
+            for rows in [[outcome[name][label] for outcome in outcomes]]
         }
         for name in scenarios
     }
-    return Result(tracks, runs, seed, particles)
+    scans = {name: [outcome[name]["scans"] for outcome in outcomes] for name in scenarios}
+    return Result(tracks, scans, runs, seed, particles)
 
 
 def _trial(rng: np.random.Generator, scenarios: tuple[str, ...], particles: int) -> dict[str, Any]:
-    outcome: dict[str, Any] = {}
     root = int(rng.integers(2**62))
-    for name in scenarios:
-        scenario, outcome[name] = SCENARIOS[name], {}
-        for number, (label, setting) in enumerate(scenario.settings.items()):
-            own = 0 if scenario.detected is not None else number
-            place = list(SCENARIOS).index(name)
-            scans = scenario.measurements(setting, np.random.default_rng([root, place, own]))
-            config = filter_config(setting, particles, root % 2**31)
-            outcome[name][label] = follow(scenario, scans, config)
+    return {
+        name: (_recorded if SCENARIOS[name].sound else _listed)(SCENARIOS[name], particles, root, place)
+        for place, name in enumerate(SCENARIOS)
+        if name in scenarios
+    }
+
+
+def _recorded(scenario: Scenario, particles: int, root: int, place: int) -> dict[str, Any]:
+    """One recording, filtered with every setting."""
+    scans = scenario.recorded(root + place)
+    outcome: dict[str, Any] = {"scans": scans}
+    for label, setting in scenario.settings.items():
+        config = filter_config(setting, particles, root % 2**31, MIN_DETECTED_S)
+        outcome[label] = (*follow(scenario, scans, config), np.full(len(scans), np.nan))
     return outcome
 
 
+def _listed(scenario: Scenario, particles: int, root: int, place: int) -> dict[str, Any]:
+    """Delays drawn at each setting's own rates, filtered without and with their labels."""
+    outcome: dict[str, Any] = {}
+    for number, (label, setting) in enumerate(scenario.settings.items()):
+        rng = np.random.default_rng([root, place, number])
+        heard = scenario.heard(setting, rng)
+        scans = mixed(heard, setting.false_alarms, rng)
+        config = filter_config(setting, particles, root % 2**31)
+        told, _ = follow(scenario, list(heard), config, ToldFilter)
+        outcome[label] = (*follow(scenario, scans, config), told)
+        outcome.setdefault("scans", scans)
+    return outcome
+
+
+class ToldFilter(FocalizationFilter):
+    """The same filter told which pair each delay belongs to and which are false: no other can do better.
+
+    A scan is one delay for each pair [s], NaN where it was missed.
+    """
+
+    def _observable(self, measured_s: np.ndarray) -> np.ndarray:
+        return np.asarray(measured_s, float)
+
+    def _likelihood(
+        self, states: np.ndarray, measured: np.ndarray, receiver_depth_m: float | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        predicted = self.model.tdoas(states[:, RANGE], states[:, DEPTH], receiver_depth_m)
+        there = np.isfinite(measured)
+        off = (predicted - measured)[:, there] / self._std[there]
+        return -0.5 * (off**2).sum(axis=1), np.full(len(states), float(there.sum()))
+
+
 def follow(
-    scenario: Scenario, scans: list[np.ndarray], config: FocalizationConfig
+    scenario: Scenario,
+    scans: Sequence[np.ndarray | None],
+    config: FocalizationConfig,
+    kind: type[FocalizationFilter] = FocalizationFilter,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Posterior mean and standard deviation of range [m] at each scan."""
-    tracker = FocalizationFilter(ImageModel(scenario.water_depth_m, SOUND_SPEED_MPS), config)
+    tracker = kind(ImageModel(scenario.water_depth_m, SOUND_SPEED_MPS), config)
     found = [
         tracker.step(measured, SCAN_S if i else 0.0, float(depth))
         for i, (measured, depth) in enumerate(zip(scans, scenario.receiver_m, strict=True))
@@ -207,18 +274,25 @@ def follow(
 
 @dataclass(frozen=True)
 class Tracks:
-    """Range estimates of all runs of one setting and the filter's own standard deviations [m], (run, scan)."""
+    """Range estimates of all runs of one setting, the filter's own standard deviations, and the estimates of a
+    filter told the labels (NaN where there are none) [m], dims (run, scan).
+    """
 
     range_m: np.ndarray
     std_m: np.ndarray
+    told_m: np.ndarray
 
     def rmse(self, truth_m: np.ndarray) -> np.ndarray:
         """Root mean square error over the runs at each scan [m]."""
-        return np.sqrt(np.mean((self.range_m - truth_m) ** 2, axis=0))
+        return _rmse(self.range_m, truth_m)
 
     def spread(self) -> np.ndarray:
         """Root mean square of the filter's own standard deviation at each scan [m]."""
         return np.sqrt(np.mean(self.std_m**2, axis=0))
+
+
+def _rmse(range_m: np.ndarray, truth_m: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean((range_m - truth_m) ** 2, axis=0))
 
 
 def settled(time_s: np.ndarray, rmse_m: np.ndarray, limit_m: float) -> float | None:
@@ -234,31 +308,30 @@ def settled(time_s: np.ndarray, rmse_m: np.ndarray, limit_m: float) -> float | N
     return None
 
 
-def information_nats(setting: Setting, detected: float | None = None) -> float:
+def information_nats(setting: Setting) -> float:
     """Mean log-likelihood ratio by which a scan favours the true range over a place where no pair fits.
 
-    The delays near pair l are a Poisson process of density λ + d N(·; g, σ²) against λ: Σ_l ∫ (λ + d' N)
-    ln(1 + d N/λ) − d, with d the filter's probability of detection and d' the true one. Telling n places
-    apart takes ln n of these, whatever the filter.
+    The delays near pair l are a Poisson process of density λ + d N(·; g, σ²) against λ: Σ_l ∫ (λ + d N)
+    ln(1 + d N/λ) − d. Telling n places apart takes ln n of these, whatever the filter.
     """
     density = setting.false_alarms / MAX_TDOA_S
     total = 0.0
-    for assumed in setting.detection_probability:
-        true = assumed if detected is None else detected
+    for chance in setting.detection_probability:
 
-        def gain(x: float, assumed: float = assumed, true: float = true) -> float:
-            pulse = norm.pdf(x) / TDOA_STD_S
-            return (density + true * pulse) * np.log1p(assumed * pulse / density) * TDOA_STD_S
+        def gain(x: float, chance: float = chance) -> float:
+            pulse = chance * norm.pdf(x) / TDOA_STD_S
+            return (density + pulse) * np.log1p(pulse / density) * TDOA_STD_S
 
-        total += quad(gain, -8.0, 8.0)[0] - assumed
+        total += quad(gain, -8.0, 8.0)[0] - chance
     return total
 
 
 @dataclass(frozen=True)
 class Result:
-    """Tracks of all runs: `tracks[scenario][setting]`."""
+    """Tracks of all runs, `tracks[scenario][setting]`, and what they were made from, `scans[scenario][run]`."""
 
     tracks: dict[str, dict[str, Tracks]]
+    scans: dict[str, list[list[np.ndarray | None]]]
     runs: int
     seed: int
     particles: int
@@ -278,24 +351,44 @@ class Result:
         `range_rmse_m` : median over time, after the first 30 s, of the RMSE over the runs; `settled_s`: time
         from which it is within a tenth of the prior's for 30 s, null if never; `median_error_m`: the same
         medians of the absolute error; `filter_std_m`: of the filter's own standard deviation (root mean
-        square over the runs); `final_rmse_m`: over the last 30 s; `information_nats`.
+        square over the runs); `final_rmse_m`: over the last 30 s. Where delays are drawn at the listed rates,
+        `told_rmse_m` and `told_settled_s`: the first two of a filter told the labels; `information_nats`.
         """
         scenario, tracks = SCENARIOS[name], self.tracks[name][label]
         time, truth = scenario.time_s, scenario.range_m
         rmse, late = tracks.rmse(truth), time >= WARM_UP_S
         error = np.median(np.abs(tracks.range_m - truth), axis=0)
         limit = SETTLED_SHARE * abs(MAX_RANGE_M / 2 - truth[0])
-        return {
+        row = {
             "range_rmse_m": float(np.median(rmse[late])),
             "settled_s": settled(time, rmse, limit),
             "settled_limit_m": float(limit),
             "median_error_m": float(np.median(error[late])),
             "filter_std_m": float(np.median(tracks.spread()[late])),
             "final_rmse_m": float(np.median(rmse[time > time[-1] - WARM_UP_S])),
-            "information_nats": information_nats(scenario.settings[label], scenario.detected),
             "simulated": True,
             "runs": self.runs,
         }
+        if scenario.sound is None:
+            told = _rmse(tracks.told_m, truth)
+            row["told_rmse_m"], row["told_settled_s"] = (
+                float(np.median(told[late])),
+                settled(time, told, limit),
+            )
+            row["information_nats"] = information_nats(scenario.settings[label])
+        return row
+
+    def heard(self, name: str) -> tuple[np.ndarray, float]:
+        """Share of the scans in which each pair is heard (within 2 σ), dims (pair,), and delays per scan."""
+        delays = SCENARIOS[name].delays()
+        near, counts = np.zeros(delays.shape[1]), 0
+        for scans in self.scans[name]:
+            for true, measured in zip(delays, scans, strict=True):
+                values = np.empty(0) if measured is None else measured
+                counts += len(values)
+                near += (np.abs(values[:, None] - true) < 2 * TDOA_STD_S).any(axis=0)
+        total = len(self.scans[name]) * len(delays)
+        return near / total, counts / total
 
     def table(self) -> str:
         """The numbers beside what the paper says, as plain text."""

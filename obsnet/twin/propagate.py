@@ -289,7 +289,8 @@ INTERPOLATOR = _interpolator()
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _at(signal, position, table):  # type: ignore[no-untyped-def]
+def sample_at(signal, position, table):  # type: ignore[no-untyped-def]
+    """Real and imaginary part of a complex signal at a fractional sample, by the taps of `INTERPOLATOR`."""
     whole = int(np.floor(position))
     scaled = (position - whole) * PHASES
     row = int(scaled)
@@ -314,8 +315,8 @@ def _add_path(  # type: ignore[no-untyped-def]
             w = (i - m * step) / step
             x = position[m] + (position[m + 1] - position[m]) * w
             d = dipole[m] + (dipole[m + 1] - dipole[m]) * w
-            direct_re, direct_im = _at(signal, x + d, table)
-            image_re, image_im = _at(signal, x - d, table)
+            direct_re, direct_im = sample_at(signal, x + d, table)
+            image_re, image_im = sample_at(signal, x - d, table)
             s = complex(direct_re - image_re, direct_im - image_im)
             p = ((strength[m] + (strength[m + 1] - strength[m]) * w) * s).real
             pressure[i] += p

@@ -13,7 +13,15 @@ from obsnet.kinematics import StraightCourse
 from obsnet.ocean.bottom import Bottom
 from obsnet.twin.course import WaypointCourse
 from obsnet.twin.noise import below_nyquist, gaussian_noise
-from obsnet.twin.propagate import INTERPOLATOR, OVERSAMPLING, Field, Paths, Sediment, _at, add_moving_source
+from obsnet.twin.propagate import (
+    INTERPOLATOR,
+    OVERSAMPLING,
+    Field,
+    Paths,
+    Sediment,
+    add_moving_source,
+    sample_at,
+)
 
 SPEED, DEPTH, DENSITY, RATE = 1500.0, 4000.0, 1030.0, 50.0
 START = 1369130400
@@ -161,7 +169,7 @@ def test_interpolation_is_exact_for_band_limited_signals():
     signal = np.fft.ifft(spectrum).astype(np.complex64)
     positions = generator.uniform(100, n - 100, 200)
     exact = np.exp(2j * np.pi * np.outer(positions, np.arange(n)) / n) @ spectrum / n
-    found = np.array([complex(*_at(signal, x, INTERPOLATOR)) for x in positions])
+    found = np.array([complex(*sample_at(signal, x, INTERPOLATOR)) for x in positions])
     assert np.sqrt(np.mean(np.abs(found - exact) ** 2)) < 3e-4 * np.std(signal)
 
 
