@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from collections.abc import Generator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,27 +54,27 @@ def track(
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     reference = read_reference(ais, station, quiet=quiet) if ais else None
+    task = runs.track if tracking else runs.detect
     with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
-        bar = stack.enter_context(ExitStack())
-        progress = bar.enter_context(console.progress("reading and detecting", quiet))
-        report: list[Beside] = []
-
-        def draw(heard: Run) -> None:
-            bar.close()  # its thread would keep the process from being copied
-            task = heard.drawing(folder / "report.png", reference)
-            report.append(stack.enter_context(Beside(task, jobs)))
-
-        task = runs.track if tracking else runs.detect
-        run = task(
-            waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
-            progress=progress, amplitudes=amplitudes, heard=draw,
-        )  # fmt: skip
-        report[0].tell((run.segments, run.tracks, run.info))
+        report = stack.enter_context(Beside(_drawing(folder / "report.png", reference), jobs))
+        with console.progress("reading and detecting", quiet) as progress:
+            run = task(
+                waveforms, station, settings, starttime=start, endtime=end, folder=folder, threads=jobs,
+                progress=progress, amplitudes=amplitudes, heard=report.tell,
+            )  # fmt: skip
+        report.tell((run.segments, run.tracks, run.info))
         runs.write_tables(run, folder)
-        report[0].finish()
+        report.finish()
         console.heed()
     if not quiet:
         _summary(run, out)
+
+
+def _drawing(path: Path, reference: list | None) -> Generator[None, Any, None]:
+    """The report, for a process beside this one: matplotlib is loaded there, while this one reads."""
+    from obsnet.plots.report import drawing
+
+    yield from drawing(path, reference)
 
 
 def watch(

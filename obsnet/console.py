@@ -129,14 +129,18 @@ def progress(text: str, quiet: bool) -> Iterator[Callable[[float, float], None]]
             TextColumn("{task.percentage:3.0f} %"),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task(text, total=None)
+        bar = Progress(*columns, console=Console(stderr=True))
+        task = bar.add_task(text, total=None)
 
-            def draw(done: float, total: float) -> None:
-                heed()
-                bar.update(task, completed=done, total=total)
+        def draw(done: float, total: float) -> None:
+            heed()
+            bar.start()  # not before: its thread would keep a process from being copied
+            bar.update(task, completed=done, total=total)
 
+        try:
             yield draw
+        finally:
+            bar.stop()
     else:
         yield _Tenths(text)
 

@@ -41,5 +41,9 @@ class ModelError(ObsnetError, ValueError):
     """A model file is not one of ours, was altered, or does not fit the data."""
 
 
+class WorkerDied(ObsnetError, RuntimeError):
+    """A process that did part of the work ended before it was done."""
+
+
 class FilterError(ObsnetError, ArithmeticError):
     """A filter lost all its weight: the data contradict every particle."""

@@ -7,8 +7,9 @@ were cut into blocks, and its memory does not grow with the record.
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
@@ -16,6 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from obsnet.beside import Crew
 from obsnet.detectors.analytic import (
     AnalyticAzimuthDetector,
     AnalyticRangeDetector,
@@ -45,6 +47,9 @@ if TYPE_CHECKING:
 _HORIZONTALS = {"east", "north"}
 
 _SQUARED = {"m/s": "m2 s-2"}
+
+_STRETCH = 30
+"""Minutes whose maps are made at a time."""
 
 LONG_SILENCE_S = 86400.0
 """A silence longer than this has no rows; the record goes on after it as if it began there."""
@@ -109,6 +114,15 @@ class Minutes:
     features: xr.Dataset
 
 
+@dataclass(frozen=True)
+class _Coming:
+    """Minutes of which some maps are still being made."""
+
+    minutes: np.ndarray
+    maps: list[list[Future]]
+    features: xr.Dataset
+
+
 class Pipeline:
     """Turns consecutive blocks of spectra into likelihood maps at UTC multiples of the detectors' step.
 
@@ -118,7 +132,7 @@ class Pipeline:
     config : RunConfig
     amplitudes : strength of each path pair against range; by default weak, broad curves
         scaled to the depth (`Amplitudes.broad`).
-    threads : for the detectors; all cores by default.
+    workers : how many make maps beside this process; with one a minute is finished as soon as its frames are there.
     table : propagation table, if it is not to be made from `config.ocean`.
     begin : s since 1970; earlier frames are heard, so that the filters have learned by then, but have no minutes.
     """
@@ -129,17 +143,17 @@ class Pipeline:
         config: RunConfig = RunConfig(),
         amplitudes: Amplitudes | None = None,
         table: xr.Dataset | None = None,
-        threads: int | None = None,
+        workers: int = 1,
         begin: float = -np.inf,
     ) -> None:
-        self.station, self.config, self.begin, self._threads = station, config, begin, threads
+        self.station, self.config, self.begin = station, config, begin
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         expected = amplitudes or Amplitudes.broad().scaled_to(station.depth_m)
-        self._azimuth = AnalyticAzimuthDetector(config.azimuth, threads)
+        self._azimuth = AnalyticAzimuthDetector(config.azimuth)
         self._learned = (
             _learned_azimuth(config) if config.detector in ("learned", "learned-azimuth") else None
         )
-        self._range = _range_detector(config, self.table, expected, threads)
+        self._range = _range_detector(config, self.table, expected)
         self._clutter = ClutterFilter(config.cepstrogram)
         self._background = BackgroundDirection(
             config.azimuth.background_window_s,
@@ -154,15 +168,18 @@ class Pipeline:
         self._followed: list[StationScans] = []
         self._next: float | None = None
         self._last: float | None = None
+        self._coming: deque[_Coming] = deque()
+        self._most = 2 * workers if workers > 1 else 0
+        self._crew = Crew(self._detect, workers)
 
     def push(self, spectra: xr.Dataset) -> list[Minutes]:
         """Take the next block of spectra; return the minutes that it finishes, if any."""
         if not spectra.sizes["time"]:
             return []
         times = to_posix(spectra["time"].values)
-        finished: list[Minutes | None] = []
+        finished: list[Minutes] = []
         if self._last is not None and times[0] - self._last > LONG_SILENCE_S:
-            finished.append(self.flush())
+            finished += self.flush()
             self._azigram = self._null = self._cepstrogram = self._spectrogram = self._next = None
             if self._learned is not None:
                 self._learned.reset()
@@ -172,19 +189,27 @@ class Pipeline:
         self._last = float(times[-1])
         ready = times[-1] - self.config.azimuth.window_s / 2
         looks = self._learned is not None and (self._azigram is not None or set(spectra) >= _HORIZONTALS)
-        finished.append(
-            self._finish(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s, spectra)
-        )
-        return [minutes for minutes in finished if minutes is not None]
+        self._begin(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s, spectra)
+        return finished + self._done(self._most)
 
-    def flush(self) -> Minutes | None:
-        """Finish the last minutes of a record, whose windows reach beyond its end."""
+    def flush(self) -> list[Minutes]:
+        """Finish all minutes of a record, with the last ones, whose windows reach beyond its end."""
         held = self._spectrogram
-        if held is None or not held.sizes["time"]:
-            return None
-        if self._learned is not None:
-            self._learned.finish()
-        return self._finish(float(to_posix(held["time"].values[-1])))
+        if held is not None and held.sizes["time"]:
+            if self._learned is not None:
+                self._learned.finish()
+            self._begin(float(to_posix(held["time"].values[-1])))
+        return self._done(0)
+
+    def close(self) -> None:
+        """Part from the workers; what they have not finished is lost."""
+        self._crew.close()
+
+    def __enter__(self) -> Pipeline:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.close()
 
     def followed(self) -> pd.DataFrame:
         """What the focalization tracker knew after each scan: time, range, its spread, range rate and existence."""
@@ -258,43 +283,79 @@ class Pipeline:
             "spectrogram": self._spectrogram,
         }
 
-    def _finish(self, ready: float, spectra: xr.Dataset | None = None) -> Minutes | None:
-        """Take the next spectra, if any, and finish the minutes up to `ready`."""
+    def _begin(self, ready: float, spectra: xr.Dataset | None = None) -> None:
+        """Take the next spectra, if any, and begin the minutes up to `ready`."""
         step = self.config.azimuth.step_s
         count = int(np.floor((ready - self._next) / step + 1e-6)) + 1 if self._next is not None else 0
         minutes = (self._next or 0.0) + step * np.arange(max(count, 0))
         if spectra is not None:
             self._spectrogram = _concat(self._spectrogram, _power(spectra))
-        parts = [part for part in self._parts(minutes, spectra) if part is not None]
+        ranges, azimuths = self._range_maps(minutes, spectra), self._azimuth_maps(minutes, spectra)
         if not len(minutes):
-            return None
-        if not parts:
+            return
+        if not azimuths and not ranges:
             raise ConfigError(
                 f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with"
             )
+        self._coming.append(_Coming(minutes, [azimuths, ranges], self._features(minutes)))
+        self._next = float(minutes[-1] + step)
+        self._forget(self._next - self.config.azimuth.window_s / 2)
+
+    def _done(self, most: int) -> list[Minutes]:
+        """The minutes that are done, in order, waiting where more than so many parts are still to come."""
+        done = []
+        while self._coming:
+            coming = sum(not part.done() for one in self._coming for maps in one.maps for part in maps)
+            if coming > most or all(part.done() for maps in self._coming[0].maps for part in maps):
+                done.append(self._finished(self._coming.popleft()))
+            else:
+                break
+        return done
+
+    def _finished(self, coming: _Coming) -> Minutes:
+        parts = [_joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
         ratios = presence(maps)
-        features = self._features(minutes)
+        features = coming.features
         for name in ("approaching", "leaving"):
             if name in ratios:
                 features[f"{name}_llr"] = ("time", ratios[name].to_numpy(np.float32), {"units": "1"})
-        result = Minutes(maps, detections(maps, ratios), ratios, features)
-        self._next = float(minutes[-1] + step)
-        self._forget(self._next - self.config.azimuth.window_s / 2)
-        return result
+        return Minutes(maps, detections(maps, ratios), ratios, features)
 
-    def _parts(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[xr.Dataset | None]:
-        """Azimuth and range maps, made at the same time where there are threads."""
-        if self._threads == 1:
-            return [self._azimuth_maps(minutes, spectra), self._range_maps(minutes, spectra)]
-        with ThreadPoolExecutor(1) as beside:
-            azimuth = beside.submit(self._azimuth_maps, minutes, spectra)
-            ranges = self._range_maps(minutes, spectra)
-            return [azimuth.result(), ranges]
+    def _detect(
+        self,
+        sensor: Literal["azimuth", "range"],
+        frames: xr.DataArray,
+        minutes: np.ndarray,
+        *null: np.ndarray | None,
+    ) -> xr.Dataset:
+        """Maps of some minutes by a detector that has no memory; the crew's task."""
+        return (
+            self._azimuth.maps(frames, minutes, *null)
+            if sensor == "azimuth"
+            else self._range.maps(frames, minutes)
+        )
 
-    def _azimuth_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> xr.Dataset | None:
-        """Take what the next spectra say of azimuth, and what all say of some minutes; none without horizontals."""
+    def _ordered(
+        self,
+        sensor: Literal["azimuth", "range"],
+        held: xr.DataArray,
+        minutes: np.ndarray,
+        null: np.ndarray | None = None,
+    ) -> list[Future]:
+        """Have maps made of some minutes, a stretch at a time, from the frames that each needs."""
+        start, stop = window_bounds(to_posix(held["time"].values), minutes, self.config.azimuth.window_s)
+        ordered = []
+        for lo in range(0, len(minutes), _STRETCH):
+            part = slice(lo, lo + _STRETCH)
+            frames = slice(max(start[part].min() - 2, 0), stop[part].max() + 2)
+            more = () if null is None else (null[:, frames],)
+            ordered.append(self._crew.submit(sensor, held[:, frames], minutes[part], *more))
+        return ordered
+
+    def _azimuth_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[Future]:
+        """Take what the next spectra say of azimuth, and begin some minutes; none without horizontals."""
         if spectra is not None and set(spectra) >= _HORIZONTALS:
             azimuths = azigram(spectra, self.config.azigram)
             directional = self._learned is None and self.config.azimuth.null == "directional"
@@ -305,17 +366,19 @@ class Pipeline:
             self._azigram = _concat(self._azigram, azimuths)
         held = self._azigram
         if held is None or not len(minutes):
-            return None
+            return []
         if self._learned is None:
-            return self._azimuth.maps(held, minutes, self._null)
+            return self._ordered("azimuth", held, minutes, self._null)
         window_s, times = self.config.azimuth.window_s, to_posix(held["time"].values)
         bounds = window_bounds(times, minutes, window_s)
         heard = ~np.isnan(held.values).all(axis=0)
         covered = coverage(heard, *bounds, minutes, window_s, self.config.spectra.hop_s)
-        return self._learned.maps(minutes, covered)
+        made: Future = Future()
+        made.set_result(self._learned.maps(minutes, covered))
+        return [made]
 
-    def _range_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> xr.Dataset | None:
-        """Take what the next spectra say of range, and what all say of some minutes; none without a hydrophone."""
+    def _range_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[Future]:
+        """Take what the next spectra say of range, and begin some minutes; none without a hydrophone."""
         if spectra is not None and "p" in spectra:
             cepstra = self._clutter(cepstrogram(spectra))
             self._cepstrogram = _concat(self._cepstrogram, cepstra)
@@ -323,8 +386,8 @@ class Pipeline:
                 times = to_posix(cepstra["time"].values)
                 self._followed.append(self._follower.push(cepstra.values, cepstra["quefrency"].values, times))
         if self._cepstrogram is None or not len(minutes):
-            return None
-        return self._range.maps(self._cepstrogram, minutes)
+            return []
+        return self._ordered("range", self._cepstrogram, minutes)
 
     def _features(self, minutes: np.ndarray) -> xr.Dataset:
         """Spectrogram, azigram and cepstrogram thinned to one column a minute, for the eye."""
@@ -382,14 +445,14 @@ def _learned_azimuth(config: RunConfig) -> LearnedAzimuthDetector:
 
 
 def _range_detector(
-    config: RunConfig, table: xr.Dataset, amplitudes: Amplitudes, threads: int | None
+    config: RunConfig, table: xr.Dataset, amplitudes: Amplitudes
 ) -> AnalyticRangeDetector | LearnedRangeDetector:
-    analytic = AnalyticRangeDetector(table, amplitudes, config.range, threads)
+    analytic = AnalyticRangeDetector(table, amplitudes, config.range)
     if config.detector in ("learned", "learned-range"):
         from obsnet.detectors.learned_range import LearnedRangeDetector
 
         return LearnedRangeDetector.from_model(
-            table, config.models.range, config.range, config.spectra, threads, analytic
+            table, config.models.range, config.range, config.spectra, analytic
         )
     return analytic
 
@@ -438,6 +501,13 @@ def _per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.Da
         coords={dim: frames[dim].values, "time": from_posix(minutes)},
         attrs=frames.attrs,
     )
+
+
+def _joined(parts: list[xr.Dataset]) -> xr.Dataset:
+    """Consecutive minutes in one."""
+    if len(parts) == 1:
+        return parts[0]
+    return xr.concat(parts, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
 
 
 def _concat(held: xr.DataArray | None, new: xr.DataArray) -> xr.DataArray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,7 +29,7 @@ from obsnet.ocean.rays import propagation_table, travel_time
 from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
-from obsnet.signals.spectra import ahead, iter_spectra
+from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
@@ -55,7 +55,7 @@ class Run:
     ----------
     station : Station
     maps : LikelihoodMaps (lazily read from disk after a run into a folder).
-    features : Dataset of power, azigram and cepstrogram, one column a minute.
+    features : Dataset of power, azigram and cepstrogram, one column a minute (read when it is first asked for).
     detections : DataFrame, one row a minute, the columns of detections.csv.
     presence : DataFrame of log presence ratios, indexed by s since 1970.
     segments : list of Segment. tracks : list of Track.
@@ -66,7 +66,7 @@ class Run:
     station: Station
     config: RunConfig
     maps: LikelihoodMaps
-    features: xr.Dataset
+    _features: xr.Dataset | Path
     detections: pd.DataFrame
     presence: pd.DataFrame
     segments: list[Segment]
@@ -74,6 +74,17 @@ class Run:
     table: xr.Dataset
     info: dict[str, Any] = field(default_factory=dict)
     live: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    @property
+    def features(self) -> xr.Dataset:
+        """What the station heard, one column a minute."""
+        if isinstance(self._features, Path):
+            self._features = netcdf.join_complex(netcdf.read(self._features))
+        return self._features
+
+    @features.setter
+    def features(self, made: xr.Dataset) -> None:
+        self._features = made
 
     def delay(self, range_m: np.ndarray) -> np.ndarray:
         """Travel time [s] of the loudest path against range [m]."""
@@ -96,12 +107,6 @@ class Run:
         from obsnet.plots.report import report
 
         return report(self, path, reference=reference)
-
-    def drawing(self, path: str | Path, reference: list | None = None) -> Generator[None, Any, None]:
-        """The report in two steps, as `obsnet.beside` takes them; the second is sent segments, tracks and info."""
-        from obsnet.plots.report import drawing
-
-        yield from drawing(self, path, reference)
 
 
 def detect(
@@ -133,7 +138,7 @@ def track(
     starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
     amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
     folder : write maps and features there block by block, so that memory stays flat with record length.
-    progress : called with seconds done and in all. threads : for the detectors and the search.
+    progress : called with seconds done and in all. threads : how many may work at a time, processes on the maps and threads on the search; all cores by default.
     heard : called with the run when all is heard, before tracks are looked for.
 
     Returns
@@ -173,11 +178,10 @@ def _run(
         waveforms, station, starttime=starttime, endtime=endtime, min_rate_hz=config.spectra.analysis_rate_hz
     )
     clock.lap("open")
-    pipeline = Pipeline(station, config, amplitudes, table, threads)
-    clock.lap("model")
     sink = _FolderSink(folder, station) if folder is not None else _MemorySink()
-    with sink:
-        for minutes in _stream(source, config, pipeline, progress, clock, threads):
+    with Pipeline(station, config, amplitudes, table, threads) as pipeline, sink:
+        clock.lap("model")
+        for minutes in _stream(source, config, pipeline, progress, clock):
             sink.append(minutes)
             clock.lap("write")
         _require_minutes(sink.detections(), source, config)
@@ -217,10 +221,8 @@ def _stream(
     pipeline: Pipeline,
     progress: Progress | None,
     clock: Clock,
-    threads: int,
 ) -> Iterator[Minutes]:
-    blocks = iter_spectra(source, config.spectra)
-    for spectra in blocks if threads == 1 else ahead(blocks):
+    for spectra in iter_spectra(source, config.spectra):
         clock.lap("spectra")
         finished = pipeline.push(spectra)
         clock.lap("detect")
@@ -228,10 +230,9 @@ def _stream(
             done = float(to_posix(spectra["time"].values[-1])) - source.begin_ns / 1e9
             progress(done, (source.end_ns - source.begin_ns) / 1e9)
         yield from finished
-    minutes = pipeline.flush()
+    finished = pipeline.flush()
     clock.lap("detect")
-    if minutes is not None:
-        yield minutes
+    yield from finished
 
 
 def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
@@ -324,7 +325,7 @@ class _MemorySink:
     def append(self, minutes: Minutes) -> None:
         self._minutes.append(minutes)
 
-    def close(self) -> tuple[xr.Dataset, xr.Dataset]:
+    def close(self) -> tuple[xr.Dataset, xr.Dataset | Path]:
         def joined(datasets: list[xr.Dataset]) -> xr.Dataset:
             if not datasets:
                 return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
@@ -365,13 +366,12 @@ class _FolderSink(_MemorySink):
         empty = xr.Dataset()
         self._minutes.append(Minutes(empty, minutes.detections, minutes.presence, empty))
 
-    def close(self) -> tuple[xr.Dataset, xr.Dataset]:
+    def close(self) -> tuple[xr.Dataset, xr.Dataset | Path]:
         if not self._minutes:
             return _MemorySink().close()
         for writer in self._writers:
             writer.close()
-        maps, features = (netcdf.read(self._folder / f"{name}.nc") for name in ("maps", "features"))
-        return maps, netcdf.join_complex(features)
+        return netcdf.read(self._folder / "maps.nc"), self._folder / "features.nc"
 
     def __exit__(self, *error: Any) -> None:
         for writer in self._writers:

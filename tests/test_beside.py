@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 
-from obsnet.beside import Beside
-from obsnet.errors import OutputError
+from obsnet.beside import Beside, Crew
+from obsnet.errors import ConfigError, OutputError
 
 
 def noted(path, fail=None):
@@ -69,3 +70,110 @@ def test_a_task_that_nobody_waits_for_ends_with_its_process(tmp_path):
     with pytest.raises(KeyboardInterrupt), Beside(noted(tmp_path / "note"), 2):
         raise KeyboardInterrupt
     assert "told" not in ((tmp_path / "note").read_text() if (tmp_path / "note").exists() else "")
+
+
+def thrice(number):
+    if number < 0:
+        raise ConfigError("no negative numbers")
+    return 3 * number, os.getpid()
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_crew_gives_results_and_errors(size):
+    """Here the crew may be threads: other tests may have left some."""
+    crew = Crew(thrice, size)
+    try:
+        futures = [crew.submit(n) for n in range(20)]
+        assert [crew.result_of(future)[0] for future in futures] == [3 * n for n in range(20)]
+        with pytest.raises(ConfigError, match="no negative"):
+            crew.result_of(crew.submit(-1))
+    finally:
+        crew.close()
+
+
+ALONE = """
+import os, sys, time
+from obsnet.beside import Crew
+from obsnet.errors import WorkerDied
+seen = []
+def task(what):
+    seen.append(what)
+    if what == "die":
+        os._exit(9)
+    if what == "sleep":
+        print(os.getpid(), flush=True)
+        time.sleep(60)
+    return os.getpid(), len(seen)
+"""
+
+
+def alone(code):
+    """In a process of its own, which has no threads and may be copied."""
+    return subprocess.run(
+        [sys.executable, "-c", ALONE + code], capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+def test_a_crew_is_copies_of_the_process():
+    made = alone("""
+crew = Crew(task, 2)
+found = [crew.result_of(future) for future in [crew.submit("work") for _ in range(8)]]
+crew.close()
+assert os.getpid() not in {process for process, _ in found}, found
+assert not seen
+""")
+    assert made.returncode == 0, made.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+def test_a_copy_that_dies_is_an_error():
+    made = alone("""
+crew = Crew(task, 2)
+try:
+    crew.result_of(crew.submit("die"))
+except WorkerDied as error:
+    assert "out of memory" in str(error)
+else:
+    raise SystemExit("it was not said")
+crew.close()
+""")
+    assert made.returncode == 0, made.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+def test_copies_end_with_a_process_that_is_killed():
+    made = subprocess.Popen(
+        [sys.executable, "-c", ALONE + "crew = Crew(task, 2)\ncrew.submit('sleep')\ntime.sleep(60)"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    copy = int(made.stdout.readline())
+    made.kill()
+    made.wait()
+    end = time.monotonic() + 10
+    while alive(copy) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not alive(copy)
+    made.stdout.close()
+
+
+def alive(process):
+    try:
+        with open(f"/proc/{process}/stat", encoding="ascii") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+def test_words_to_a_task_that_has_failed_are_no_error_of_their_own(tmp_path):
+    def fails():
+        yield
+        raise OutputError("no room")
+        yield
+
+    with Beside(fails(), 2) as task:
+        task.tell(1)
+        time.sleep(0.2)
+        task.tell(2)
+        with pytest.raises(OutputError, match="no room"):
+            task.finish()

@@ -29,19 +29,18 @@ def stored(state):
 def test_going_on_from_a_state_changes_nothing(blocks, detector):
     station, spectra = blocks
     config = RunConfig(detector=detector)
-    whole, current = (Pipeline(station, config, threads=1) for _ in range(2))
+    whole, current = (Pipeline(station, config) for _ in range(2))
     expected = [minutes for block in spectra for minutes in whole.push(block)]
     got = []
     for number, block in enumerate(spectra):
         if number in (0, 1, 2, 20):
             state, current = (
                 stored(current.state()),
-                Pipeline(station, config, table=whole.table, threads=1),
+                Pipeline(station, config, table=whole.table),
             )
             current.restore(state)
         got += current.push(block)
-    ends = whole.flush(), current.flush()
-    for a, b in zip([*expected, ends[0]], [*got, ends[1]], strict=True):
+    for a, b in zip([*expected, *whole.flush()], [*got, *current.flush()], strict=True):
         assert a.maps.identical(b.maps)
         assert a.detections.equals(b.detections)
         assert a.features.identical(b.features)
@@ -49,7 +48,7 @@ def test_going_on_from_a_state_changes_nothing(blocks, detector):
 
 def test_what_is_complete_stays_the_same_object(blocks):
     station, spectra = blocks
-    pipeline = Pipeline(station, RunConfig(), threads=1)
+    pipeline = Pipeline(station, RunConfig())
     for block in spectra[:12]:
         pipeline.push(block)
     before = pipeline.state()
@@ -63,4 +62,4 @@ def test_what_is_complete_stays_the_same_object(blocks):
 
 def test_a_tracker_without_a_state_is_refused(blocks):
     with pytest.raises(ConfigError, match="focalization tracker cannot be stopped"):
-        Pipeline(blocks[0], RunConfig(tracker="focalization"), threads=1).state()
+        Pipeline(blocks[0], RunConfig(tracker="focalization")).state()

@@ -28,6 +28,7 @@ from obsnet.plots.figures import DAY_ROWS, MOST_COLUMNS, MOST_TRACKS, day_rows, 
 from obsnet.plots.overlay import heard, reference_heard
 from obsnet.plots.panels import analytic_signal
 from obsnet.plots.plan import ellipse
+from obsnet.plots.report import drawing
 from obsnet.run import Run, read_run
 from obsnet.signals.station import Station
 from obsnet.trackers.track import Segment, Track
@@ -274,6 +275,27 @@ def test_report_puts_the_track_on_the_ridge_of_both_maps(run, tmp_path):
         np.testing.assert_allclose(ridge, y[shown], atol=tolerance)
     assert (tmp_path / "report.png").read_bytes()[:4] == b"\x89PNG"
     assert [path.name for path in tmp_path.iterdir()] == ["report.png"]
+
+
+def test_a_report_drawn_in_steps_is_the_same_picture(run, table, tmp_path):
+    """What is painted early is not painted again; nothing of the later parts may be lost, or hide what was there."""
+    from matplotlib.image import imread
+
+    for number, made in enumerate((run, empty_run(table))):
+        found, heard = (
+            (made.segments, made.tracks, made.info),
+            Run(**{**vars(made), "tracks": [], "segments": []}),
+        )
+        reference = [reference_of(COURSE)]
+        report(made, tmp_path / f"whole-{number}.png", reference)
+        steps = drawing(tmp_path / f"steps-{number}.png", reference)
+        next(steps)
+        steps.send(heard)
+        with pytest.raises(StopIteration):
+            steps.send(found)
+        whole, stepped = (imread(tmp_path / f"{name}-{number}.png")[..., :3] for name in ("whole", "steps"))
+        differs = np.abs(whole - stepped).max(axis=2) > 0.2
+        assert differs.mean() < 0.002
 
 
 def test_report_puts_detections_and_ais_where_they_are_heard(run):

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import xarray as xr
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("torch", "obspy", "xarray", "pandas", "numba", "onnxruntime", "scipy", "matplotlib")
@@ -58,6 +59,20 @@ def test_a_run_and_a_station_bring_no_compiler():
     assert not {"numba", "matplotlib", "scipy"} & set(
         heavy_after("import obsnet.run, obsnet.live.watch, obsnet.detectors.learned_range")
     )
+
+
+@pytest.mark.parametrize("detector", ["learned", "analytic"])
+def test_how_many_processes_make_the_maps_changes_nothing(record, tmp_path, detector):
+    for jobs in (1, 2, 5):
+        done = subprocess.run(
+            tracking(record, tmp_path / str(jobs), "--quiet", "--jobs", jobs, "--detector", detector),
+            env=environment(), capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    for name in ("detections.csv", "tracks.csv"):
+        assert len({(tmp_path / str(jobs) / name).read_bytes() for jobs in (1, 2, 5)}) == 1
+    with xr.open_dataset(tmp_path / "1/maps.nc") as one, xr.open_dataset(tmp_path / "5/maps.nc") as five:
+        assert one.identical(five)
 
 
 def test_the_check_of_imports_can_fail():

@@ -106,7 +106,7 @@ def _detect(task: DayTask, ledger: Ledger) -> dict[str, Any]:
         min_rate_hz=config.spectra.analysis_rate_hz,
     )  # fmt: skip
     table = table_of(config, station.depth_m)
-    pipeline = Pipeline(station, config, table=table, threads=1, begin=day.start)
+    pipeline = Pipeline(station, config, table=table, begin=day.start)
     step = config.azimuth.step_s
     times = from_posix(day.start + step * np.arange(round(DAY_S / step)))
     parts = []
@@ -117,10 +117,9 @@ def _detect(task: DayTask, ledger: Ledger) -> dict[str, Any]:
             for minutes in pipeline.push(block):
                 parts.append(_table(minutes))
                 maps.append(minutes.maps)
-        last = pipeline.flush()
-        if last is not None:
-            parts.append(_table(last))
-            maps.append(last.maps)
+        for minutes in pipeline.flush():
+            parts.append(_table(minutes))
+            maps.append(minutes.maps)
         rows = pd.concat(parts) if parts else pd.DataFrame(columns=MINUTE_COLUMNS)
         rows = rows.set_index("time").reindex(pd.DatetimeIndex(times, name="time")).reset_index()
         rows = rows.reindex(columns=MINUTE_COLUMNS).fillna({"coverage": 0.0})

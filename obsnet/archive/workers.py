@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -25,16 +23,13 @@ from contextlib import contextmanager
 from typing import Any
 
 from obsnet import console
-from obsnet.errors import ObsnetError, SourceError
+from obsnet.beside import leave_signals_to_parent
+from obsnet.errors import ObsnetError, SourceError, WorkerDied
 
 Task = tuple[Callable[[Any], Any], Any]
 """A function that a worker can import, and its argument."""
 
 SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-
-
-class WorkerDied(Exception):
-    """The worker process ended while it was at a task."""
 
 
 Finished = Callable[[Task, Any], Iterable[Task]]
@@ -111,7 +106,9 @@ def local_workers(jobs: int) -> Iterator[Workers]:
     before = {name: os.environ.get(name) for name in SINGLE_THREADED}
     os.environ.update(dict.fromkeys(SINGLE_THREADED, "1"))
     spawn = multiprocessing.get_context("spawn")
-    workers = Workers(lambda: ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin), lambda: jobs)
+    workers = Workers(
+        lambda: ProcessPoolExecutor(jobs, mp_context=spawn, initializer=leave_signals_to_parent), lambda: jobs
+    )
     try:
         yield workers
         workers.close(wait=True)
@@ -124,19 +121,6 @@ def local_workers(jobs: int) -> Iterator[Workers]:
             os.environ.pop(name)
             if value is not None:
                 os.environ[name] = value
-
-
-def _begin() -> None:
-    """In a worker: leave interruptions to the parent, and end when it is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-
-
-def _follow_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 @contextmanager

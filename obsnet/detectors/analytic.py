@@ -7,10 +7,6 @@ their grid.
 
 from __future__ import annotations
 
-import itertools
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -151,12 +147,9 @@ class AnalyticAzimuthDetector:
 
     name = "analytic"
 
-    def __init__(
-        self, config: AzimuthDetectorConfig = AzimuthDetectorConfig(), threads: int | None = None
-    ) -> None:
+    def __init__(self, config: AzimuthDetectorConfig = AzimuthDetectorConfig()) -> None:
         self.config = config
         self.window_s = config.window_s
-        self._threads = threads or os.cpu_count() or 1
 
     def maps(
         self, azigram: xr.DataArray, minutes: np.ndarray, background: np.ndarray | None = None
@@ -211,15 +204,8 @@ class AnalyticAzimuthDetector:
         per_window = round(config.window_s / config.step_s)
         block_edges = minutes[0] - config.window_s / 2 + config.step_s * np.arange(len(minutes) + per_window)
         edges = np.searchsorted(times, block_edges - 1e-6)
-        parts = np.array_split(np.arange(real.shape[0]), min(self._threads, real.shape[0]))
-
-        def one(part: np.ndarray) -> np.ndarray:
-            band = slice(part[0], part[-1] + 1)
-            return kernels.tonal(
-                real[band], imag[band], null[band], edges, per_window, angle, config.mean_resultant_length
-            )
-
-        return np.log(sum(_in_threads(one, [(part,) for part in parts], self._threads)) / real.shape[0])
+        total = kernels.tonal(real, imag, null, edges, per_window, angle, config.mean_resultant_length)
+        return np.log(total / real.shape[0])
 
 
 class AnalyticRangeDetector:
@@ -232,13 +218,11 @@ class AnalyticRangeDetector:
         propagation: xr.Dataset,
         amplitudes: Amplitudes,
         config: RangeDetectorConfig = RangeDetectorConfig(),
-        threads: int | None = None,
     ) -> None:
         self.config = config
         self.window_s = config.window_s
         self._propagation = propagation
         self._amplitudes = amplitudes
-        self._threads = threads or os.cpu_count() or 1
         self._bank: MatchedFilters | None = None
 
     def maps(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> xr.Dataset:
@@ -262,15 +246,12 @@ class AnalyticRangeDetector:
         scores = bank.scores(np.where(valid[:, None], frames, 0.0), valid)
         start, stop = window_bounds(times, minutes, config.window_s)
         llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
-
-        def one(lo: int, hi: int) -> None:
+        for lo in range(0, len(minutes), _WINDOWS):
+            part = slice(lo, lo + _WINDOWS)
             beam = kernels.slant_stack(
-                scores, bank.margin, start[lo:hi], stop[lo:hi], times, minutes[lo:hi], config.range_step_m, config.range_rate
+                scores, bank.margin, start[part], stop[part], times, minutes[part], config.range_step_m, config.range_rate
             )  # fmt: skip
-            llr[lo:hi] = bank.wandering(beam).transpose(0, 2, 1)
-
-        bounds = np.unique(np.append(np.arange(0, len(minutes), _WINDOWS), len(minutes)))
-        _in_threads(one, list(itertools.pairwise(bounds)), self._threads)
+            llr[part] = bank.wandering(beam).transpose(0, 2, 1)
         covered = coverage(valid, start, stop, minutes, config.window_s, hop(times))
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
@@ -387,13 +368,6 @@ def _interp_phase(phase_deg: xr.DataArray, range_m: np.ndarray) -> np.ndarray:
     """Phase [rad] at `range_m`, interpolated on the circle."""
     phasor = phase_deg.copy(data=np.exp(1j * np.deg2rad(phase_deg.values)))
     return np.angle(_interp(phasor, range_m))
-
-
-def _in_threads(task: Callable, arguments: list[tuple], threads: int) -> list:
-    if threads == 1:
-        return [task(*argument) for argument in arguments]
-    with ThreadPoolExecutor(threads) as pool:
-        return [future.result() for future in [pool.submit(task, *argument) for argument in arguments]]
 
 
 def _check_product(config: AzimuthDetectorConfig, hop_s: float) -> None:

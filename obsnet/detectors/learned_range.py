@@ -9,9 +9,7 @@ of its own window alone, so that maps do not depend on how a record is cut.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,13 +28,14 @@ from obsnet.signals.spectra import SpectraConfig
 
 BATCH = 1024
 STRETCH = 30
-"""Minutes of a record at a time: what threads share."""
+"""Minutes of a record at a time."""
 CARRIED_SLOPE = 0.3
 """Fall of the ratio with the cheap score's, towards range rates at which the network did not look."""
 END_SLOPE = 0.1
 """Slope of a minute's ratio of presence beyond the strongest evidence that validation held."""
 SHAPE_SLOPE, SHAPE_REACH_M, SHAPE_REACH_MPS = 0.4, 280.0, 2.0
-"""Power of the analytic likelihood ratio that shares out what the network gives to a lobe, and how far it moves it."""
+"""Power of the analytic likelihood ratio that shares out what the network gives to a lobe, and how far it moves it, in minutes
+in which the network's ratio of presence speaks for a ship."""
 Scorer = Callable[[np.ndarray], np.ndarray]
 """Feature vectors (n, size) float32 in, log likelihood ratios (n) float32 out."""
 
@@ -92,7 +91,6 @@ class LearnedRangeDetector:
     calibration, features : as the network was trained and calibrated.
     config : RangeDetectorConfig, of which the grids and the windows hold.
     shape : detector of the fine shape; None leaves the network's blur.
-    threads : that share a record's minutes.
     """
 
     name = "learned"
@@ -105,9 +103,7 @@ class LearnedRangeDetector:
         features: RangeFeaturesConfig = RangeFeaturesConfig(),
         config: RangeDetectorConfig = RangeDetectorConfig(),
         shape: AnalyticRangeDetector | None = None,
-        threads: int | None = None,
     ) -> None:
-        self._threads = threads or os.cpu_count() or 1
         self.config, self.calibration, self._shape = config, calibration, shape
         self.window_s = config.window_s
         self.file: ModelFile | None = None
@@ -121,14 +117,13 @@ class LearnedRangeDetector:
         model: str | Path | None = None,
         config: RangeDetectorConfig = RangeDetectorConfig(),
         spectra: SpectraConfig = SpectraConfig(),
-        threads: int | None = None,
         shape: AnalyticRangeDetector | None = None,
     ) -> LearnedRangeDetector:
         """Detector of an ONNX file; by default of the one that is shipped.
 
         Parameters
         ----------
-        spectra : of the frames to come. threads : that share a record's minutes. shape : detector of the fine shape.
+        spectra : of the frames to come. shape : detector of the fine shape.
 
         Raises
         ------
@@ -144,7 +139,7 @@ class LearnedRangeDetector:
         def score(found: np.ndarray) -> np.ndarray:
             return run(session, {"features": found})
 
-        made = cls(propagation, score, calibration, features, config, shape, threads)
+        made = cls(propagation, score, calibration, features, config, shape)
         made.file = file
         return made
 
@@ -164,22 +159,15 @@ class LearnedRangeDetector:
         times = to_posix(cepstrogram["time"].values)
         start, stop = window_bounds(times, minutes, config.window_s)
         llr = np.empty((len(minutes), len(config.range_m), len(config.range_rate)), np.float32)
-        fine = None if self._shape is None else self._shape.maps(cepstrogram, minutes)["range_llr"].values
-
-        def one(lo: int) -> None:
+        told = np.empty(len(minutes), bool)
+        for lo in range(0, len(minutes), STRETCH):
             part = slice(lo, lo + STRETCH)
             heard = cepstrogram[:, max(start[part].min() - 1, 0) : stop[part].max() + 1]
-            llr[part] = self._on_grid(self.ratios(heard, minutes[part]))
-            if fine is not None:
-                self._share_out(llr[part], fine[part])
-
-        parts = range(0, len(minutes), STRETCH)
-        if min(self._threads, len(parts)) > 1:
-            with ThreadPoolExecutor(self._threads) as pool:
-                list(pool.map(one, parts))
-        else:
-            for lo in parts:
-                one(lo)
+            coarse = self.ratios(heard, minutes[part])
+            told[part] = presence_ratio(coarse, self._front.config) > 0
+            llr[part] = self._on_grid(coarse)
+        if self._shape is not None:
+            self._share_out(llr, self._shape, cepstrogram, minutes, np.flatnonzero(told))
         covered = coverage(
             ~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop(times)
         )
@@ -193,10 +181,22 @@ class LearnedRangeDetector:
             coarse, *_weights(config.range_m, grid.range_m), *_weights(config.range_rate, grid.range_rate)
         )
 
-    def _share_out(self, llr: np.ndarray, fine: np.ndarray) -> None:
+    def _share_out(
+        self,
+        llr: np.ndarray,
+        shape: AnalyticRangeDetector,
+        cepstrogram: xr.DataArray,
+        minutes: np.ndarray,
+        chosen: np.ndarray,
+    ) -> None:
+        """Give the ratios of chosen minutes the fine shape of `shape`'s, in place."""
         config = self.config
         reach = round(SHAPE_REACH_M / config.range_step_m), round(SHAPE_REACH_MPS / _step(config.range_rate))
-        kernels.share_out(llr, fine, SHAPE_SLOPE, *reach, config.range_m)
+        for lo in range(0, len(chosen), STRETCH):
+            part = chosen[lo : lo + STRETCH]
+            shared, fine = llr[part], shape.maps(cepstrogram, minutes[part])["range_llr"].values
+            kernels.share_out(shared, fine, SHAPE_SLOPE, *reach, config.range_m)
+            llr[part] = shared
 
     def ratios(self, cepstrogram: xr.DataArray, minutes: np.ndarray) -> np.ndarray:
         """Calibrated log-likelihood ratios on the features' own grid, (minute, rate, range) float32."""

@@ -29,7 +29,7 @@ class LiveConfig:
     selectors : SeedLink selectors, such as BH? BDH; all channels of the StationXML by default.
     memory_h : longest segment that is searched as a whole; its maps stay on disk until it closes.
     strips_h : how long columns of the maps are kept for the page of `obsnet serve`; 0 for none.
-    threads : of the compiled loops.
+    threads : of the grid search.
     nmea : where NMEA sentences go: udp://HOST:PORT or tcp://HOST:PORT (a server there); nowhere by default.
     talker : two letters before TTM and TLL.
     http : HOST:PORT of /healthz and /metrics; none by default.

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ class LiveStation:
     ) -> None:
         self.station, self.config, self.folder, self._say = station, config, folder, say
         self._amplitudes = amplitudes
-        self.pipeline = Pipeline(station, config, amplitudes, table, config.live.threads)
+        self.pipeline = Pipeline(station, config, amplitudes, table)
         self.store = Store(folder)
         self.buffer = WaveformBuffer(station, config.spectra, config.live)
         self.ships = Ships(self.store, station, config, self.pipeline.table)
@@ -143,10 +144,9 @@ class LiveStation:
         if self.buffer.next_frame is None:
             return
         self._lasting(self._snapshot, patient=False)
-        minutes = self.pipeline.flush()
-        if minutes is not None:
+        for minutes in self.pipeline.flush():
             self._lasting(
-                lambda: self._keep_minutes(minutes, self.estimate.step(minutes.maps)), patient=False
+                partial(self._keep_minutes, minutes, self.estimate.step(minutes.maps)), patient=False
             )
             self.files.append([str(t) for t in rounded(minutes.detections)["time"]])
         ((last_track,),) = self.store.rows("SELECT coalesce(max(track), 0) FROM tracks")
@@ -157,12 +157,8 @@ class LiveStation:
     def begin_anew(self, why: str, patient: bool = True) -> None:
         """Close the record and start another, as after a silence that is too long to have rows."""
         self._say(why)
-        minutes = self.pipeline.flush()
-        if minutes is not None:
-            self._publish([minutes], patient)
-        self.pipeline = Pipeline(
-            self.station, self.config, self._amplitudes, self.pipeline.table, self.config.live.threads
-        )
+        self._publish(self.pipeline.flush(), patient)
+        self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
         self.buffer = WaveformBuffer(self.station, self.config.spectra, self.config.live)
         self._builder, self._snapshot_frame, self._pending = None, None, []
         self._late_since = None
@@ -198,13 +194,9 @@ class LiveStation:
         self._channels = self.buffer.seen
         self._builder = SpectraBuilder(self.buffer, self.config.spectra, frame, frame + _FOREVER)
         if before is not None and before != set(self._builder.units):
-            minutes = self.pipeline.flush()
-            if minutes is not None:
-                self._publish([minutes], patient)
+            self._publish(self.pipeline.flush(), patient)
             self._say(f"channels are now {', '.join(self._channels)}: a new record begins")
-            self.pipeline = Pipeline(
-                self.station, self.config, self._amplitudes, self.pipeline.table, self.config.live.threads
-            )
+            self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
 
     def _cuts(self, first: int, last: int) -> Iterator[tuple[int, int, bool]]:
         """Ranges of frames that end where a snapshot may be taken."""

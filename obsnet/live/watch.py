@@ -51,7 +51,7 @@ def watch_source(
 
         prepare_folder(out)
         open_source(source, station, config.live, {}, None, once)
-        Pipeline(station, config, amplitudes, table, config.live.threads).state()
+        Pipeline(station, config, amplitudes, table).state()
         say(f"{station.code}: configuration, station, detector, source and output folder are in order")
         return
     live = LiveStation(station, config, out, amplitudes, table, say)

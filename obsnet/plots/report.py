@@ -17,7 +17,6 @@ from obsnet.plots import overlay, panels, style
 from obsnet.plots.columns import Columns
 from obsnet.plots.plan import close_up, plan_view
 from obsnet.run import Run
-from obsnet.trackers.track import Segment, Track
 
 if TYPE_CHECKING:
     from obsnet.ais import ReferenceTrack
@@ -63,14 +62,17 @@ def report(run: Run, path: str | Path | None = None, reference: list[ReferenceTr
     return page.figure
 
 
-def drawing(
-    run: Run, path: str | Path, reference: list[ReferenceTrack] | None = None
-) -> Generator[None, tuple[list[Segment], list[Track], dict[str, Any]], None]:
-    """The report in two steps: what was heard at once, and when the run's segments, tracks and info are sent, the rest."""
+def drawing(path: str | Path, reference: list[ReferenceTrack] | None = None) -> Generator[None, Any, None]:
+    """The report in steps, as `obsnet.beside.Beside` takes them, the same picture as `report` makes.
+
+    It is sent the run when all is heard, and paints that; then the run's segments, tracks and info, and paints those over it.
+    """
+    run: Run = yield
     page = Page(run)
+    painting = style.Painting(page.figure)
     run.segments, run.tracks, run.info = yield
     page.fill(run, reference or [])
-    style.save(page.figure, path)
+    painting.save(path)
 
 
 class Page:
@@ -90,11 +92,11 @@ class Page:
             style.say(place, "no minute of data")
             return
         top = _PAGE[1] - 0.45
-        for name, draw, height in _ROWS:
+        for _, draw, height in _ROWS:
             ax = style.box(self.figure, _LEFT, top - height, _WIDTH, height)
             top -= height + 0.1
             draw(ax, run, self._columns)
-            style.name(ax, name)
+            style.time_axis(ax, self._columns.start, self._columns.end, labelled=draw is panels.range_map)
             self._panels.append(ax)
 
     def fill(self, run: Run, reference: list[ReferenceTrack]) -> None:
@@ -104,12 +106,12 @@ class Page:
             return
         start, end = self._columns.start, self._columns.end
         reference = [ship for ship in reference if ship.endtime > start and ship.starttime < end]
-        for ax, (_, draw, _) in zip(self._panels, _ROWS, strict=True):
+        for ax, (name, draw, _) in zip(self._panels, _ROWS, strict=True):
             if draw in (panels.azimuth_map, panels.range_map):
                 kind: overlay.Kind = "azimuth" if draw is panels.azimuth_map else "range"
                 overlay.curves(ax, run, reference, kind, start, end)
                 overlay.detections(ax, run, kind, start, end)
-            style.time_axis(ax, start, end, labelled=draw is panels.range_map)
+            style.name(ax, name)
         _plan_and_words(self.figure, run, reference, start, end)
         style.title(self.figure, f"{run.station.code}, {style.span(start, end)}: {_found(run)}")
 

@@ -7,14 +7,16 @@ colours of Okabe and Ito, each with a marker or a line style of its own. Missing
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
+from matplotlib.image import AxesImage, imsave
 
 from obsnet.errors import OutputError
 from obsnet.layout import iso
@@ -158,6 +160,35 @@ def span(start: float, end: float) -> str:
     return f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
 
 
+class Painting:
+    """A figure painted as far as it is made, to which more is added later: what is there is not painted again.
+
+    What is added lies above what was there, whatever its `zorder`.
+
+    Parameters
+    ----------
+    made : figure of `figure`.
+    """
+
+    def __init__(self, made: Figure) -> None:
+        self._figure, self._canvas = made, FigureCanvasAgg(made)
+        self._canvas.draw()
+        self._axes = list(made.axes)
+        self._painted = set(map(id, self._artists()))
+
+    def _artists(self) -> list[Artist]:
+        """What a later addition may be: children of the figure and of its axes at the time of the first painting."""
+        return [*self._figure.get_children(), *(child for ax in self._axes for child in ax.get_children())]
+
+    def save(self, path: str | Path) -> Path:
+        """Paint what was added and write the figure as PNG; errors as for `save`."""
+        new = [artist for artist in self._artists() if id(artist) not in self._painted]
+        for artist in sorted(new, key=lambda artist: artist.get_zorder()):
+            artist.draw(self._canvas.get_renderer())
+        pixels = self._canvas.buffer_rgba()
+        return _write(path, lambda file, **how: imsave(file, pixels, format="png", dpi=DPI, **how))
+
+
 def save(made: Figure, path: str | Path) -> Path:
     """Write a figure as PNG, aside first and then in place.
 
@@ -166,10 +197,14 @@ def save(made: Figure, path: str | Path) -> Path:
     OutputError
         The file cannot be written.
     """
+    return _write(path, lambda file, **how: made.savefig(file, format="png", dpi=DPI, **how))
+
+
+def _write(path: str | Path, write: Callable[..., Any]) -> Path:
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        made.savefig(partial, format="png", dpi=DPI, pil_kwargs={"compress_level": 2})
+        write(partial, pil_kwargs={"compress_level": 1})
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)

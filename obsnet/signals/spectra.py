@@ -16,8 +16,7 @@ sampling grid, or a drifting clock, is a phase: frames take the nearest samples 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -158,16 +157,6 @@ def iter_spectra(source: WaveformSource, config: SpectraConfig = SpectraConfig()
     for first, last in spans:
         for begin in range(first, last, step):
             yield builder.block(np.arange(begin, min(begin + step, last)))
-
-
-def ahead(blocks: Iterable[xr.Dataset]) -> Iterator[xr.Dataset]:
-    """The same blocks, each made in a thread while the one before is worked on; memory of two."""
-    waiting = iter(blocks)
-    with ThreadPoolExecutor(1) as beside:
-        coming = beside.submit(next, waiting, None)
-        while (block := coming.result()) is not None:
-            coming = beside.submit(next, waiting, None)
-            yield block
 
 
 def _spans(source: WaveformSource, config: SpectraConfig) -> list[tuple[int, int]]:

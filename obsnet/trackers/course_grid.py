@@ -32,8 +32,9 @@ class Delay:
         """Travel time at ranges, linear; the last beyond the table."""
         position = np.minimum(range_m / self.step_m, len(self.seconds) - 1)
         below = np.minimum(position.astype(np.int64), len(self.seconds) - 2)
-        low = self.seconds[below]
-        return low + (position - below) * (self.seconds[below + 1] - low)
+        seconds = self.seconds.astype(position.dtype, copy=False)
+        low = seconds[below]
+        return low + (position - below.astype(position.dtype)) * (seconds[below + 1] - low)
 
     def emitted(self, heard: np.ndarray, cpa_range: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """When what is heard `heard` s after CPA left the ship, s after CPA: solves e + τ(R(e)) = heard."""
@@ -189,7 +190,7 @@ def score_points(
     -------
     scores (n), and each tile's share of them (n_tiles, n); float64.
     """
-    cpa_time, _, course, _ = points[:, :4].T
+    cpa_time, course = points[:, 0], points[:, 2].astype(np.float32)
     per_tile = np.empty((len(tiles), len(points)))
     bins, rates = scores.azimuth_score.shape[1], scores.range_score.shape[2]
     azimuth_score, range_score = scores.azimuth_score.reshape(-1), scores.flat.reshape(-1)
@@ -200,9 +201,9 @@ def score_points(
         distance = np.sqrt(side * side + ahead * ahead)
         corner, right, up = scores.corner(distance, rate / np.maximum(distance, 1.0))
         share = _between(range_score, corner + tile * scores.flat.shape[1], rates, right, up)
-        turn = (course + np.rad2deg(np.arctan2(side, ahead))) % 360.0 / scores.azimuth_step
+        turn = (course + np.rad2deg(np.arctan2(side, ahead))) % 360.0 / float(scores.azimuth_step)
         below = turn.astype(np.int64)
-        after = turn - below
+        after = turn - below.astype(turn.dtype)
         pointing = azimuth_score.take(tile * bins + below % bins) * (1 - after)
         pointing += azimuth_score.take(tile * bins + (below + 1) % bins) * after
         if scores.jointly:
@@ -219,17 +220,17 @@ def _heard(
     heard: np.ndarray, points: np.ndarray, delay: Delay, reach_s: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the ship was when what is heard `heard` s after CPA left it: m to starboard and ahead; its range times its rate."""
-    _, cpa_range, _, speed = points[:, :4].T
+    # Single precision is a centimetre at 100 km, and several times as fast.
+    heard, points = heard.astype(np.float32), points.astype(np.float32)
+    _, cpa_range, _, speed = np.ascontiguousarray(points[:, :4].T)
     if reach_s is None:
         ahead = speed * delay.emitted(heard, cpa_range, speed)
         return cpa_range, ahead, speed * ahead
-    # Single precision is a centimetre at 100 km, and several times as fast.
-    heard, points, reach_s = (values.astype(np.float32) for values in (heard, points, reach_s))
-    _, cpa_range, _, speed = points[:, :4].T
+    reach_s = reach_s.astype(np.float32)
     bends, turn = points[:, 4:12].T.reshape(-1, 2, 2, len(points)), points[:, 12:].T
     emitted = heard - _travel(heard, points, delay, reach_s)
     side, ahead, _, _ = _departed(emitted, cpa_range, speed, bends, turn, reach_s)
-    emitted = heard - delay(np.sqrt(side * side + ahead * ahead)).astype(np.float32)
+    emitted = heard - delay(np.sqrt(side * side + ahead * ahead))
     side, ahead, sideways, forwards = _departed(emitted, cpa_range, speed, bends, turn, reach_s)
     return side, ahead, side * sideways + ahead * forwards
 
@@ -246,7 +247,7 @@ def _travel(heard: np.ndarray, points: np.ndarray, delay: Delay, reach_s: np.nda
         side, ahead, _, _ = _departed(
             since - travel, middle[1], middle[3], middle[4:12].reshape(-1, 2, 2, 1), middle[12:], reach_s
         )
-        travel = delay(np.sqrt(side * side + ahead * ahead)).astype(np.float32)
+        travel = delay(np.sqrt(side * side + ahead * ahead))
     return travel
 
 

@@ -195,9 +195,12 @@ class _Finder:
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
         coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
+        starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
+        if not starts:
+            return None
         fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
         best, point = 0.0, None
-        for start in self._coarse(coarse, (least + self._runs) / self.config.exponent):
+        for start in starts:
             best, point = self._level(start, MEDIUM, fine, best, point)
         if point is None:
             return None

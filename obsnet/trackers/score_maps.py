@@ -53,12 +53,13 @@ class ScoreMaps:
     def corner(self, range_m: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Index into `flat` of the grid point below in range and rate, and how far right and up of it, in grid steps."""
         _, n_range, n_rate = self.range_score.shape
-        x = (range_m - self.geometry[0]) / self.geometry[1]
-        y = (rate - self.geometry[2]) / self.geometry[3]
+        first, step, first_rate, rate_step = self.geometry.tolist()
+        x, y = (range_m - first) / step, (rate - first_rate) / rate_step
         inside = (x >= 0) & (x < n_range - 1) & (y >= 0) & (y < n_rate - 1)
         x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
         a, b = x.astype(np.int64), y.astype(np.int64)
-        return np.where(inside, a * n_rate + b, n_range * n_rate), x - a, y - b
+        right, up = x - a.astype(x.dtype), y - b.astype(y.dtype)
+        return np.where(inside, a * n_rate + b, n_range * n_rate), right, up
 
 
 def tiles(

@@ -56,7 +56,7 @@ def maps_of(station, spectra, size=97, middle=None):
     """Azimuth maps of a run cut into blocks; with `middle`, stopped and continued at that frame."""
     config = RunConfig(detector="learned-azimuth")
     spectra = spectra[["east", "north", *(["p"] if "p" in spectra else [])]]
-    pipeline, found = Pipeline(station, config, threads=1), []
+    pipeline, found = Pipeline(station, config), []
     before = 0
     edges = sorted(
         {*range(size, spectra.sizes["time"], size), spectra.sizes["time"], *([middle] if middle else [])}
@@ -65,11 +65,10 @@ def maps_of(station, spectra, size=97, middle=None):
         found += pipeline.push(spectra.isel(time=slice(before, edge)))
         if edge == middle:
             state = {key: value.copy() for key, value in pipeline.state().items()}
-            pipeline = Pipeline(station, config, threads=1)
+            pipeline = Pipeline(station, config)
             pipeline.restore(state)
         before = edge
-    last = pipeline.flush()
-    found += [last] if last is not None else []
+    found += pipeline.flush()
     return xr.concat([part.maps[["azimuth_llr", "azimuth_coverage"]] for part in found], "time")
 
 

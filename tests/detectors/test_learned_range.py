@@ -163,11 +163,9 @@ def test_a_flat_shape_and_missing_minutes_change_nothing():
     assert np.isnan(llr[1]).all()
 
 
-def test_threads_share_the_minutes_and_change_nothing(table, cepstra, monkeypatch):
-    monkeypatch.setattr("obsnet.detectors.learned_range.STRETCH", 3)
+def test_how_many_minutes_are_looked_at_together_changes_nothing(table, cepstra, monkeypatch):
     shape = AnalyticRangeDetector(table, Amplitudes.broad().scaled_to(4000.0))
-    one, two = (LearnedRangeDetector(table, energies, shape=shape, threads=n) for n in (1, 2))
-    maps = [detector.maps(cepstra, MINUTES)["range_llr"].values for detector in (one, two)]
-    np.testing.assert_array_equal(*maps)
-    monkeypatch.setattr("obsnet.detectors.learned_range.STRETCH", 30)
-    np.testing.assert_allclose(one.maps(cepstra, MINUTES)["range_llr"].values, maps[0], atol=1e-4)
+    detector = LearnedRangeDetector(table, energies, shape=shape)
+    together = detector.maps(cepstra, MINUTES)["range_llr"].values
+    monkeypatch.setattr("obsnet.detectors.learned_range.STRETCH", 3)
+    np.testing.assert_allclose(detector.maps(cepstra, MINUTES)["range_llr"].values, together, atol=1e-4)
