@@ -70,7 +70,7 @@ class Beside:
 
     def __exit__(self, *error: Any) -> None:
         if self._copy is not None:
-            self._copy.terminate()
+            self._copy.kill()  # a gentler signal is lost on a copy that is being made
             self._copy.join()
             self._line.close()
 

@@ -1,6 +1,7 @@
 """A task beside this process: it works at once, hears a word, and its errors come back."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -70,6 +71,17 @@ def test_a_task_that_nobody_waits_for_ends_with_its_process(tmp_path):
     with pytest.raises(KeyboardInterrupt), Beside(noted(tmp_path / "note"), 2):
         raise KeyboardInterrupt
     assert "told" not in ((tmp_path / "note").read_text() if (tmp_path / "note").exists() else "")
+
+
+def test_a_task_that_is_left_at_once_ends(tmp_path):
+    """A process that handles a request to terminate hands its handler to the copy, until that has its own."""
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        for _ in range(30):
+            with Beside(noted(tmp_path / "note"), 2):
+                pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def thrice(number):

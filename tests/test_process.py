@@ -8,6 +8,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -96,10 +97,9 @@ def test_an_interrupted_run_leaves_what_was_there(record, finished, tmp_path, nu
     with subprocess.Popen(
         tracking(record, out), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        while "10 %" not in process.stdout.readline():
+        while not any(any(stage.iterdir()) for stage in out.glob(".*.tmp")):
             assert process.poll() is None
-        (stage,) = out.glob(".*.tmp")
-        assert any(stage.iterdir())
+            time.sleep(0.01)
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + number
