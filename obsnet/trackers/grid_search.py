@@ -49,7 +49,7 @@ class GridSearchConfig:
     exponent: float = 1.0
     max_cpa_range_m: float = 50_000.0
     min_speed_mps: float = 3.0
-    max_speed_mps: float = 13.0
+    max_speed_mps: float = 15.0
     candidates: int = 6
     max_ships: int = 4
     min_log_bayes_factor: float = 10.0
