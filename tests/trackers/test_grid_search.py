@@ -77,6 +77,13 @@ def test_known_course_comes_back_on_its_side(cpa_range, course):
     assert found.log_bayes_factor > 50.0
 
 
+def test_a_fast_liner_is_a_ship_and_leaves_nothing_to_be_taken_for_one():
+    truth = StraightCourse(T0 + 6600.0, 8_000.0, 92.0, 12.9)
+    (found,) = search(maps_of([truth], MINUTES, np.random.default_rng(12)), SEGMENT, delay)
+    assert abs(found.motion.speed_mps - 12.9) < 0.4
+    assert abs(found.motion.cpa_range_m - 8_000.0) < 500.0
+
+
 def test_one_ship_gives_one_track_and_ghosts_none():
     truth = StraightCourse(T0 + 7000.0, 12_000.0, 60.0, 9.0)
     tracks = search(maps_of([truth], MINUTES, np.random.default_rng(2)), SEGMENT, delay)
