@@ -120,6 +120,8 @@ class Ships:
         store.put("tiles", ("seconds", "arrays"), _tiles(minutes.maps, config.grid_search.tile_s))
         quiet = quiet_until(self._presence, config.segmentation)
         needed = max(oldest, self._closed, -math.inf if quiet is None else quiet)
+        # What is quiet again has closed a segment: its maps are needed until it has been searched.
+        needed = min([needed, *(segment.start for segment in self.close())])
         store.execute("DELETE FROM tiles WHERE seconds < ?", (needed,))
         said, axes = _grid(minutes.maps)
         held = store.noted("grid", {"variables": {}, "axes": {}})

@@ -7,9 +7,13 @@ import sqlite3
 import numpy as np
 import pytest
 
+import obsnet
+from obsnet.config import build
+from obsnet.layout import to_posix
 from obsnet.live.sources import Folder
+from obsnet.pipeline import RunConfig
 
-from .conftest import Given, by_eight, differences, packets, rows
+from .conftest import SMALL, Given, by_eight, differences, packets, rows
 
 
 def arrivals(made, delay, rng, latency=55.0):
@@ -43,6 +47,29 @@ def test_tracks_of_a_closed_segment_are_the_batch_tracks(live, hour, batch, tmp_
     np.testing.assert_allclose(a, b, rtol=1e-3)
     shape = json.loads((tmp_path / "live" / "tracks.geojson").read_text())
     assert shape["features"][0]["geometry"]["type"] == "LineString"
+
+
+@pytest.mark.parametrize("size", [4, 400])
+def test_a_ship_is_said_when_its_segment_closes_not_only_when_the_record_ends(
+    live, hour, station, table, tmp_path, size
+):
+    again = hour.copy()
+    for trace in again:
+        trace.stats.starttime += 3 * 3600
+    both = hour + again
+    expected = obsnet.track(both, station, build(RunConfig, SMALL), table=table, threads=1).tracks
+    assert len(expected) == 2
+    made = sorted(packets(both, lambda: 10.0), key=lambda packet: packet.end_ns)
+    said = []
+    watched = live(say=said.append)
+    watched.run(Given([made[i : i + size] for i in range(0, len(made), size)]), once=True)
+    got = (tmp_path / "live" / "tracks.csv").read_text().splitlines()[1:]
+    whole = [track.row(1) for track in expected]
+    assert [line.split(",")[1:3] for line in got] == [[row["start"], row["end"]] for row in whole]
+    cpa = [np.datetime64(line.split(",")[3].removesuffix("Z")) for line in got]
+    for found, track in zip(cpa, expected, strict=True):
+        assert abs(to_posix(found) - track.motion.cpa_time) < 0.5  # maps are stored packed
+    assert len([line for line in said if "track" in line]) == 2
 
 
 def test_horizontals_that_come_late_still_give_a_course(live, hour, tmp_path):
