@@ -6,7 +6,6 @@ were cut into blocks, and its memory does not grow with the record.
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -34,6 +33,7 @@ from obsnet.ocean.rays import propagation_table
 from obsnet.ocean.sound_speed import OceanConfig
 from obsnet.signals.azigram import AzigramConfig, azigram
 from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstrogram
+from obsnet.signals.held import followed_by, laid_out, per_minute, taken_up, thinned_power
 from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
 from obsnet.trackers.grid_search import GridSearchConfig
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from obsnet.trackers.station_focalization import StationFocalization, StationScans
 
 _HORIZONTALS = {"east", "north"}
-
-_SQUARED = {"m/s": "m2 s-2"}
 
 _STRETCH = 30
 """Minutes whose maps are made at a time."""
@@ -254,7 +252,7 @@ class Pipeline:
             arrays |= {f"{name}/{key}": value for key, value in stage.state().items()}
         for name, held in self._held().items():
             if held is not None:
-                arrays |= {f"{name}/{key}": value for key, value in _laid_out(held).items()}
+                arrays |= {f"{name}/{key}": value for key, value in laid_out(held).items()}
         if self._null is not None:
             arrays["null"] = self._null
         return arrays
@@ -267,7 +265,7 @@ class Pipeline:
         for name, stage in self._stages().items():
             stage.restore(_under(state, name))
         self._azigram, self._cepstrogram, self._spectrogram = (
-            _taken_up(_under(state, name)) for name in self._held()
+            taken_up(_under(state, name)) for name in self._held()
         )
         self._null = state.get("null")
 
@@ -289,7 +287,7 @@ class Pipeline:
         count = int(np.floor((ready - self._next) / step + 1e-6)) + 1 if self._next is not None else 0
         minutes = (self._next or 0.0) + step * np.arange(max(count, 0))
         if spectra is not None:
-            self._spectrogram = _concat(self._spectrogram, _power(spectra))
+            self._spectrogram = followed_by(self._spectrogram, thinned_power(spectra))
         ranges, azimuths = self._range_maps(minutes, spectra), self._azimuth_maps(minutes, spectra)
         if not len(minutes):
             return
@@ -363,7 +361,7 @@ class Pipeline:
             if self._learned is not None:
                 self._learned.take(spectra)
             self._null = null if self._null is None else _join(self._null, null)
-            self._azigram = _concat(self._azigram, azimuths)
+            self._azigram = followed_by(self._azigram, azimuths)
         held = self._azigram
         if held is None or not len(minutes):
             return []
@@ -381,7 +379,7 @@ class Pipeline:
         """Take what the next spectra say of range, and begin some minutes; none without a hydrophone."""
         if spectra is not None and "p" in spectra:
             cepstra = self._clutter(cepstrogram(spectra))
-            self._cepstrogram = _concat(self._cepstrogram, cepstra)
+            self._cepstrogram = followed_by(self._cepstrogram, cepstra)
             if self._follower is not None:
                 times = to_posix(cepstra["time"].values)
                 self._followed.append(self._follower.push(cepstra.values, cepstra["quefrency"].values, times))
@@ -399,7 +397,7 @@ class Pipeline:
             ("cepstrogram", self._cepstrogram),
         ):
             if held is not None:
-                features[name] = _per_minute(held, minutes, step)
+                features[name] = per_minute(held, minutes, step)
         return xr.Dataset(features).assign_coords(time=from_posix(minutes))
 
     def _forget(self, before: float) -> None:
@@ -413,25 +411,6 @@ class Pipeline:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
-
-
-def _laid_out(frames: xr.DataArray) -> dict[str, np.ndarray]:
-    """Frames as plain arrays: values, time, the other coordinate, and name, dims and attributes in JSON."""
-    said = json.dumps({"name": frames.name, "dims": frames.dims, "attrs": frames.attrs})
-    return {
-        "values": frames.values,
-        "time": frames["time"].values.astype(np.int64),
-        "axis": frames[frames.dims[0]].values,
-        "said": np.frombuffer(said.encode(), np.uint8),
-    }
-
-
-def _taken_up(arrays: Mapping[str, np.ndarray]) -> xr.DataArray | None:
-    if not arrays:
-        return None
-    said = json.loads(arrays["said"].tobytes())
-    coords = {said["dims"][0]: arrays["axis"], "time": arrays["time"].astype("datetime64[ns]")}
-    return xr.DataArray(arrays["values"], coords, said["dims"], said["name"], said["attrs"])
 
 
 def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
@@ -463,60 +442,11 @@ def _follower(table: xr.Dataset, amplitudes: Amplitudes | None) -> StationFocali
     return StationFocalization(table, amplitudes=amplitudes)
 
 
-def _power(spectra: xr.Dataset) -> xr.DataArray:
-    """Power of the pressure (or of the ground motion without one) in bins of eight, so that a minute is small."""
-    values = (
-        spectra["p"]
-        if "p" in spectra
-        else spectra[next(name for name in ("down", "north", "east") if name in spectra)]
-    )
-    power = values.values.real**2 + values.values.imag**2
-    bins = power.shape[0] // 8
-    thinned = power[: bins * 8].reshape(bins, 8, -1).mean(axis=1)
-    centre = spectra["frequency"].values[: bins * 8].reshape(bins, 8).mean(axis=1)
-    coords = {"spectrogram_frequency": centre, "time": spectra["time"].values}
-    unit = values.attrs.get("units", "1")
-    attrs = {"long_name": "squared amplitude of a tone", "units": _SQUARED.get(unit, f"{unit}2")}
-    return xr.DataArray(thinned, coords, ("spectrogram_frequency", "time"), "power", attrs)
-
-
-def _per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.DataArray:
-    """Mean of the frames within half a step of each minute; NaN where there is none."""
-    times = to_posix(frames["time"].values)
-    edges = np.searchsorted(times, np.append(minutes - step / 2, minutes[-1] + step / 2))
-    values = frames.values
-    valid = ~np.isnan(values[0])
-    total = np.concatenate(
-        [np.zeros((len(values), 1), values.dtype), np.cumsum(np.where(valid, values, 0), axis=1)], axis=1
-    )
-    count = np.concatenate([[0], np.cumsum(valid)])
-    number = count[edges[1:]] - count[edges[:-1]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (total[:, edges[1:]] - total[:, edges[:-1]]) / number
-    mean[:, number == 0] = np.nan
-    dim = frames.dims[0]
-    return xr.DataArray(
-        mean,
-        dims=(dim, "time"),
-        coords={dim: frames[dim].values, "time": from_posix(minutes)},
-        attrs=frames.attrs,
-    )
-
-
 def _joined(parts: list[xr.Dataset]) -> xr.Dataset:
     """Consecutive minutes in one."""
     if len(parts) == 1:
         return parts[0]
     return xr.concat(parts, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
-
-
-def _concat(held: xr.DataArray | None, new: xr.DataArray) -> xr.DataArray:
-    if held is None or not held.sizes["time"]:
-        return new
-    dim = new.dims[0]
-    coords = {dim: new[dim].values, "time": np.concatenate([held["time"].values, new["time"].values])}
-    values = np.concatenate([held.values, new.values], axis=1)
-    return xr.DataArray(values, dims=new.dims, coords=coords, name=new.name, attrs=new.attrs)
 
 
 def _join(held: np.ndarray, new: np.ndarray | None) -> np.ndarray | None:
