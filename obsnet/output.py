@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import tempfile
@@ -54,15 +53,13 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
         target = prepare_folder(folder)
         _sweep(target)
         stage = Path(tempfile.mkdtemp(prefix=".unfinished-", suffix=".tmp", dir=target))
-        held = os.open(stage, os.O_RDONLY)
         try:
-            fcntl.flock(held, fcntl.LOCK_SH)
-            yield stage
+            with _locked(stage):
+                yield stage
             _move(stage, target, leftovers)
         except OutputError as error:
             raise OutputError(str(error).replace(str(stage), str(target))) from None
         finally:
-            os.close(held)
             shutil.rmtree(stage, ignore_errors=True)
     finally:
         for path in made:
@@ -70,17 +67,30 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
                 path.rmdir()
 
 
+@contextmanager
+def _locked(folder: Path, alone: bool = False) -> Iterator[None]:
+    """Hold a lock on a folder; `OSError` where it is to be held `alone` and another holds it."""
+    if os.name != "posix":
+        if alone:
+            raise OSError("folders cannot be locked here: what a killed run left stays")
+        yield
+        return
+    import fcntl
+
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(held)
+
+
 def _sweep(folder: Path) -> None:
     """Remove what a run that was killed has left: its lock went with it. What is young may not be locked yet."""
     for path in folder.glob(".unfinished-*.tmp"):
-        with suppress(OSError):
-            held = os.open(path, os.O_RDONLY)
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if time.time() - path.stat().st_mtime > _YOUNG_S:
-                    shutil.rmtree(path, ignore_errors=True)
-            finally:
-                os.close(held)
+        with suppress(OSError), _locked(path, alone=True):
+            if time.time() - path.stat().st_mtime > _YOUNG_S:
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def _move(stage: Path, folder: Path, leftovers: tuple[str, ...]) -> None:

@@ -25,7 +25,7 @@ from obsnet.detectors.analytic import (
 )
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
 from obsnet.detectors.background import BackgroundDirection
-from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, presence, window_bounds
+from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, joined, presence, window_bounds
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -215,12 +215,12 @@ class Pipeline:
             return pd.DataFrame()
         scans = [*self._followed, self._follower.flush()]
 
-        def joined(name: str) -> np.ndarray:
+        def column(name: str) -> np.ndarray:
             return np.concatenate([getattr(scan, name) for scan in scans])
 
-        table = {"time": from_posix(joined("time_s")), "existence_llr": joined("existence_llr")}
+        table = {"time": from_posix(column("time_s")), "existence_llr": column("existence_llr")}
         names = ("range_mode_m", "mode_probability", "range_mean_m", "range_std_m", "range_rate_mps")
-        return pd.DataFrame(table | {name: joined(name) for name in (*names, "range_rate_std_mps")})
+        return pd.DataFrame(table | {name: column(name) for name in (*names, "range_rate_std_mps")})
 
     @property
     def models(self) -> dict[str, str]:
@@ -311,7 +311,7 @@ class Pipeline:
         return done
 
     def _finished(self, coming: _Coming) -> Minutes:
-        parts = [_joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
+        parts = [joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
         ratios = presence(maps)
@@ -440,13 +440,6 @@ def _follower(table: xr.Dataset, amplitudes: Amplitudes | None) -> StationFocali
     from obsnet.trackers.station_focalization import StationFocalization
 
     return StationFocalization(table, amplitudes=amplitudes)
-
-
-def _joined(parts: list[xr.Dataset]) -> xr.Dataset:
-    """Consecutive minutes in one."""
-    if len(parts) == 1:
-        return parts[0]
-    return xr.concat(parts, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
 
 
 def _join(held: np.ndarray, new: np.ndarray | None) -> np.ndarray | None:

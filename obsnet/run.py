@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 import obsnet
 from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
-from obsnet.detectors.maps import LikelihoodMaps
+from obsnet.detectors.maps import LikelihoodMaps, joined
 from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
@@ -326,13 +326,6 @@ class _MemorySink:
         self._minutes.append(minutes)
 
     def close(self) -> tuple[xr.Dataset, xr.Dataset | Path]:
-        def joined(datasets: list[xr.Dataset]) -> xr.Dataset:
-            if not datasets:
-                return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
-            return xr.concat(
-                datasets, "time", data_vars="minimal", coords="minimal", compat="override", join="override"
-            )
-
         return joined([m.maps for m in self._minutes]), joined([m.features for m in self._minutes])
 
     def detections(self) -> pd.DataFrame:

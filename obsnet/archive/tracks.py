@@ -22,6 +22,7 @@ import xarray as xr
 import obsnet
 from obsnet.archive.day import known_station, one_line, table_of
 from obsnet.archive.ledger import DAY_S, Day, Ledger, put
+from obsnet.detectors.maps import joined
 from obsnet.errors import ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.rays import travel_time
@@ -153,12 +154,10 @@ def _maps(ledger: Ledger, days: list[Day]) -> xr.Dataset:
         )
         for held in opened
     ]
-    joined = xr.concat(
-        whole, "time", data_vars="minimal", coords="minimal", compat="override", join="override"
-    )
-    for values in joined.variables.values():
+    maps = joined(whole)
+    for values in maps.variables.values():
         values.encoding = {}
-    return joined
+    return maps
 
 
 def _minutes(ledger: Ledger, days: list[Day]) -> pd.DataFrame:

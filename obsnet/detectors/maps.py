@@ -36,6 +36,15 @@ class Detector(Protocol):
         ...
 
 
+def joined(parts: list[xr.Dataset]) -> xr.Dataset:
+    """Datasets of consecutive minutes in one; none give one without minutes."""
+    if not parts:
+        return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
+    if len(parts) == 1:
+        return parts[0]
+    return xr.concat(parts, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
+
+
 def window_bounds(
     frame_time: np.ndarray, minutes: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Benchmarks as ratios measured in one run: ``make bench``.
 
-    python tests/bench/bench.py [--hours 8] [--repeat 3] [--python PYTHON] [--no-obsea] [--no-day] [--no-experiments]
+    python tests/bench/bench.py [--hours 8] [--repeat 3] [--python PYTHON] [--detector learned] [--no-obsea] [--no-day] [--no-experiments]
 
 Waveforms are simulated. Whole processes are timed from outside, those of obsnet by the interpreter PYTHON: in an environment
 that holds its base install they do not load what only others need (xarray loads dask wherever it is). `obsea`'s figure is the sum of its stages (azimuth, clutter,
@@ -67,9 +67,9 @@ def record(folder: Path, hours: float) -> None:
     subprocess.run(command, check=True)
 
 
-def track(python: str, folder: Path, repeat: int) -> tuple[float, float, float]:
+def track(python: str, folder: Path, repeat: int, detector: str) -> tuple[float, float, float]:
     command = [python, "-m", "obsnet", "track", str(folder / "waveforms.mseed"), "--station", str(folder / "station.xml"),
-               "--out", str(folder / "out"), "--quiet"]  # fmt: skip
+               "--out", str(folder / "out"), "--quiet", "--detector", detector]  # fmt: skip
     return timed(command, repeat)
 
 
@@ -94,6 +94,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=8.0)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--python", default=sys.executable)
+    parser.add_argument("--detector", default="learned")
     parser.add_argument("--no-obsea", action="store_true")
     parser.add_argument("--no-day", action="store_true")
     parser.add_argument("--no-experiments", action="store_true")
@@ -105,7 +106,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "short"
         record(folder, arguments.hours)
-        wall, processor, peak = track(arguments.python, folder, arguments.repeat)
+        wall, processor, peak = track(arguments.python, folder, arguments.repeat, arguments.detector)
         stages = json.loads((folder / "out" / "run.json").read_text())["seconds"]
         print(
             f"obsnet track, whole process, {arguments.hours:g} h: {wall:.2f} s ({processor:.2f} s on the processors), "
@@ -131,7 +132,9 @@ def main() -> None:
         if not arguments.no_day:
             day = Path(temporary) / "day"
             record(day, 24.0)
-            wall, processor, peak = track(arguments.python, day, max(arguments.repeat - 2, 1))
+            wall, processor, peak = track(
+                arguments.python, day, max(arguments.repeat - 2, 1), arguments.detector
+            )
             print(
                 f"obsnet track, a station-day: {wall:.2f} s ({processor:.2f} s on the processors), {peak:.0f} MB"
             )
