@@ -44,6 +44,8 @@ Progress = Callable[[float, float], None]
 """Called with seconds of record done and in all."""
 
 NEIGHBOUR_S = 3600.0
+BEARINGS_SHORTEST_S = 3600.0
+"""Bearings over less say too little of where a ship is, and that it is one."""
 """A track that ended no longer than this before a segment may explain what is heard in it."""
 
 
@@ -313,7 +315,10 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         speed_std_mps=2.0,
         delay=delay,
     )
-    return [] if found is None else [found]
+    if found is None or found.end - found.start < BEARINGS_SHORTEST_S:
+        return []
+    moves = found.extra["log_bayes_factor_fixed"] >= run.config.grid_search.min_log_bayes_factor
+    return [found] if moves else []
 
 
 class _MemorySink:

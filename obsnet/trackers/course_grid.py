@@ -283,3 +283,20 @@ def _departed(
         side, sideways = side + swing * beyond, sideways + swing * (beyond != 0)
         ahead, forwards = ahead + less * beyond, forwards + less * (beyond != 0)
     return cpa_range + speed * side, speed * ahead, speed * sideways, speed * forwards
+
+
+def apart(values: np.ndarray, most: int) -> list[tuple[int, int, int]]:
+    """Places of the greatest positive values (cpa_time, cpa_range, speed), apart in CPA range and speed, best first."""
+    plane = values.max(axis=0)
+    found = []
+    for _ in range(most):
+        i, j = np.unravel_index(plane.argmax(), plane.shape)
+        if plane[i, j] <= 0:
+            break
+        found.append((int(values[:, i, j].argmax()), int(i), int(j)))
+        plane[np.ix_(_near(i, 3, plane.shape[0]), _near(j, 2, plane.shape[1]))] = -1.0
+    return found
+
+
+def _near(index: int, reach: int, count: int) -> np.ndarray:
+    return np.arange(max(index - reach, 0), min(index + reach + 1, count))

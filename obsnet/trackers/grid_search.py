@@ -18,7 +18,7 @@ import xarray as xr
 from obsnet.errors import ConfigError
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
-from obsnet.trackers.course_grid import CourseGrid, Delay, best_first, score_points
+from obsnet.trackers.course_grid import CourseGrid, Delay, apart, best_first, score_points
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import (
     ScoreMaps,
@@ -37,7 +37,8 @@ class GridSearchConfig:
 
     `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
     and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
-    reach `min_log_bayes_factor_next`, since what is left of the first is not noise. A track must be heard for `shortest_s`.
+    reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
+    when no other is. A track must be heard for `shortest_s`.
     `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
     to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range).
     """
@@ -54,8 +55,9 @@ class GridSearchConfig:
     max_ships: int = 4
     min_log_bayes_factor: float = 10.0
     min_log_bayes_factor_next: float = 60.0
+    min_log_bayes_factor_apart: float = 30.0
     still_deg_per_hour: float = 4.0
-    shortest_s: float = 3600.0
+    shortest_s: float = 1800.0
     range_scale_std: float = 0.005
     samples: int = 3000
     seed: int = 0
@@ -107,6 +109,9 @@ LOOSEST = (3600.0, 15_000.0)
 LOOSEST_NEXT = (1800.0, 10_000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
+APART = 0.1
+"""Share of the time that a ship is heard up to which others may be heard in it too for it to be apart from them."""
+
 COARSE_SHARE = 0.6
 """What the bound of a coarse cell is at least of the best score in it; 0.87 at the least for 46 simulated ships."""
 
@@ -150,12 +155,15 @@ def search(
     tracks: list[Track] = []
     # Without azimuths nothing tells a second ship from the first one's ghost ranges.
     for number in range(config.max_ships if "azimuth_llr" in maps else 1):
-        least = config.min_log_bayes_factor_next if tracks or known else config.min_log_bayes_factor
+        others = [*tracks, *known]
+        least = config.min_log_bayes_factor
+        if others:
+            least = min(config.min_log_bayes_factor_next, config.min_log_bayes_factor_apart)
         jointly = bool(number or known) and "azimuth_llr" in maps
         found = finder.find(azimuth_llr, range_llr, least, jointly)
-        if found is None or found.log_bayes_factor < least:
+        if found is None or found.log_bayes_factor < finder.required(found, others):
             break
-        if finder.believable(found) and (not (tracks or known) or _is_no_remainder(found)):
+        if finder.believable(found) and (not others or _is_no_remainder(found)):
             tracks.append(found)
         azimuth_llr, range_llr = finder.without(found, azimuth_llr, range_llr)
     return tracks
@@ -235,7 +243,7 @@ class _Finder:
                 break
             said = grid.scores(cells)
             values.flat[cells], headings.flat[cells] = said.max(axis=1), said.argmax(axis=1)
-            found = _apart(values, config.candidates)
+            found = apart(values, config.candidates)
         return [
             np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]) for t, i, j in found
         ]
@@ -382,6 +390,16 @@ class _Finder:
             and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
         )
 
+    def required(self, track: Track, others: Sequence[Track]) -> float:
+        """The log Bayes factor that a track must reach beside what else is known."""
+        config = self.config
+        if not others:
+            return config.min_log_bayes_factor
+        shared = sum(min(track.end, other.end) - max(track.start, other.start) for other in others
+                     if other.start < track.end and other.end > track.start)  # fmt: skip
+        alone = shared < APART * (track.end - track.start)
+        return config.min_log_bayes_factor_apart if alone else config.min_log_bayes_factor_next
+
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
         return (
@@ -457,27 +475,10 @@ class _Finder:
         return azimuth_llr, range_llr
 
 
-def _apart(values: np.ndarray, most: int) -> list[tuple[int, int, int]]:
-    """Places of the greatest positive values (cpa_time, cpa_range, speed), apart in CPA range and speed, best first."""
-    plane = values.max(axis=0)
-    found = []
-    for _ in range(most):
-        i, j = np.unravel_index(plane.argmax(), plane.shape)
-        if plane[i, j] <= 0:
-            break
-        found.append((int(values[:, i, j].argmax()), int(i), int(j)))
-        plane[np.ix_(_near(i, 3, plane.shape[0]), _near(j, 2, plane.shape[1]))] = -1.0
-    return found
-
-
 def _is_no_remainder(track: Track) -> bool:
     """Whether a further ship is heard, and located, as what is left of a known one is not."""
     located = track.std[0] < LOOSEST_NEXT[0] and track.std[1] < LOOSEST_NEXT[1]
     return bool(located and track.extra["heard"] >= 0.5)
-
-
-def _near(index: Any, reach: int, count: int) -> np.ndarray:
-    return np.arange(max(index - reach, 0), min(index + reach + 1, count))
 
 
 def _blind(sees_course: bool) -> str:

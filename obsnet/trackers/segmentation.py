@@ -1,7 +1,8 @@
 """When is one ship heard? Presence of every minute in, segments out.
 
-Minutes are averaged over an hour or two with the chance that a detector misses (paper's eqs 24–25); where a departure is
-followed by an approach a second ship has come, and the segment is split; whatever is heard stays in a segment.
+Minutes are averaged with the chance that a detector misses (paper's eqs 24–25), over two hours as in the paper and over less:
+two hours drown a ship that is heard for forty minutes. Where a departure is followed by an approach a second ship has come,
+and the segment is split; whatever is heard stays in a segment.
 """
 
 from __future__ import annotations
@@ -18,22 +19,28 @@ from obsnet.trackers.track import Segment
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """Detection probabilities, averaging windows (minutes), shortest segment, and the most that one minute may say."""
+    """Detection probabilities, averaging windows, shortest segment (minutes), and the most that one minute may say.
+
+    A ship is heard where the average over any of the windows `average_min` speaks for it; whether it approaches or leaves is
+    averaged over `range_average_min`.
+    """
 
     azimuth_detection_probability: float = 0.9
     range_detection_probability: float = 0.6
-    azimuth_average_min: float = 120.0
+    average_min: tuple[float, ...] = (30.0, 60.0, 120.0)
     range_average_min: float = 60.0
-    shortest_min: float = 60.0
+    shortest_min: float = 30.0
     minute_bound: float = 3.0
 
     def __post_init__(self) -> None:
         for name in ("azimuth_detection_probability", "range_detection_probability"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ConfigError(f"{name} must lie in (0, 1), found {getattr(self, name)}")
-        for name in ("azimuth_average_min", "range_average_min", "shortest_min", "minute_bound"):
+        for name in ("range_average_min", "shortest_min", "minute_bound"):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
+        if not self.average_min or min(self.average_min) <= 0:
+            raise ConfigError(f"average_min must hold positive minutes, found {list(self.average_min)}")
 
 
 def mixture(log_ratio: np.ndarray, probability: float) -> np.ndarray:
@@ -100,8 +107,9 @@ def _heard(presence: pd.DataFrame, config: SegmentationConfig) -> tuple[np.ndarr
     step = float(presence.index[1] - presence.index[0])
     level = _column(presence, "range", config.range_detection_probability, config)
     azimuth = _column(presence, "azimuth", config.azimuth_detection_probability, config)
-    wide = _odd(config.azimuth_average_min * 60.0 / step)
-    return _average(azimuth + level, wide) > 0, max(len(presence) - wide // 2, 0)
+    widths = [_odd(minutes * 60.0 / step) for minutes in config.average_min]
+    heard = np.any([_average(azimuth + level, width) > 0 for width in widths], axis=0)
+    return heard, max(len(presence) - max(widths) // 2, 0)
 
 
 def _column(presence: pd.DataFrame, name: str, probability: float, config: SegmentationConfig) -> np.ndarray:

@@ -13,7 +13,7 @@ from obsnet.signals.station import Station
 SMALL = {
     "azimuth": {"azimuth_step_deg": 4.0},
     "range": {"range_step_m": 500.0, "max_range_m": 20_000.0, "range_rate_step_mps": 2.0},
-    "segmentation": {"shortest_min": 30.0, "azimuth_average_min": 21.0, "range_average_min": 11.0},
+    "segmentation": {"shortest_min": 30.0, "average_min": [21.0], "range_average_min": 11.0},
     "grid_search": {"shortest_s": 900.0},
 }
 """Coarse grids, and segments of half an hour."""

@@ -159,6 +159,25 @@ def test_what_is_located_nowhere_may_be_a_first_ship_but_no_further_one(monkeypa
         assert len(search(maps, SEGMENT, delay)) == count
 
 
+@pytest.mark.parametrize(
+    ("begins", "evidence", "count"),
+    [(130, 40.0, 2), (130, 20.0, 1), (90, 40.0, 1), (90, 80.0, 2)],
+)
+def test_a_further_ship_heard_when_no_other_is_needs_less_evidence(monkeypatch, begins, evidence, count):
+    """The first ship's remainder can only be heard while that ship is; beyond its time less may be believed."""
+
+    def ship(cpa_range, first, last, evidence):
+        course = StraightCourse(T0 + 7000.0, cpa_range, 60.0, 8.0)
+        extra = {"heard": 0.9, "log_bayes_factor_fixed": 200.0}
+        covariance = np.diag([30.0, 200.0, 5.0, 0.5]) ** 2
+        return Track(MINUTES[first], MINUTES[last], course, covariance, evidence, extra=extra)
+
+    found = iter([ship(10_000.0, 0, 130, 300.0), ship(-15_000.0, begins, 239, evidence), None])
+    monkeypatch.setattr(_Finder, "find", lambda self, *maps, found=found: next(found))
+    maps = maps_of([], MINUTES, np.random.default_rng(1))
+    assert len(search(maps, SEGMENT, delay)) == count
+
+
 def test_lobe_of_a_ship_ends_where_anothers_begins():
     azimuth = np.arange(360.0)
     row = 10.0 * np.exp(-0.5 * ((azimuth - 100.0) / 6.0) ** 2) + 8.0 * np.exp(

@@ -94,7 +94,7 @@ def test_whatever_is_heard_belongs_to_a_segment(seed):
     whole = segments(presence(ships=[(100, 600, 1100)]))
     assert found[0].start == whole[0].start and found[-1].end == whole[0].end
     assert all(before.end == after.start for before, after in pairwise(found))
-    assert all(segment.end - segment.start >= 3600 for segment in found)
+    assert all(segment.end - segment.start >= 1800 for segment in found)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -118,10 +118,32 @@ def test_one_loud_minute_cannot_make_a_segment():
     assert segments(table) == []
 
 
-def test_shorter_than_an_hour_is_dropped():
-    config = SegmentationConfig(azimuth_average_min=10, range_average_min=10)
+def test_shorter_than_the_shortest_is_dropped():
+    config = SegmentationConfig(average_min=(10,), range_average_min=10, shortest_min=60)
     assert segments(presence(ships=[(400, 420, 440)]), config) == []
     assert len(segments(presence(ships=[(400, 500, 600)]), config)) == 1
+
+
+def test_a_ship_heard_for_forty_minutes_is_a_segment_although_two_hours_drown_it():
+    table = presence(count=600)
+    table.iloc[280:320, 0] = 6.0
+    assert segments(table, SegmentationConfig(average_min=(120,))) == []
+    (segment,) = segments(table)
+    assert segment.start == pytest.approx(T0 + 60 * 280, abs=60 * 30)
+    assert segment.end == pytest.approx(T0 + 60 * 320, abs=60 * 30)
+
+
+def test_ten_loud_minutes_are_no_segment():
+    table = presence(count=600)
+    table.iloc[295:305, 0] = 20.0
+    assert segments(table) == []
+
+
+def test_averaging_windows_must_be_positive():
+    with pytest.raises(ConfigError, match="average_min must hold positive minutes"):
+        SegmentationConfig(average_min=())
+    with pytest.raises(ConfigError, match="average_min must hold positive minutes"):
+        SegmentationConfig(average_min=(60, 0))
 
 
 def test_missing_data_says_nothing():
