@@ -52,8 +52,15 @@ def _line(name: str, label: str, row: dict[str, Any]) -> str:
     text = (
         f"({label}) Pd {chances}, {setting.false_alarms:g} false alarms:".ljust(44)
         + f"RMSE {row['range_rmse_m']:5.0f} m (filter's own {row['filter_std_m']:.0f} m), "
-        f"{_when(row['settled_s'])}, last {WARM_UP_S:g} s {row['final_rmse_m']:4.0f} m"
+        f"{_when(row['settled_s'])}, worst {row['worst_rmse_m']:.0f} m, last {WARM_UP_S:g} s "
+        f"{row['final_rmse_m']:.0f} m"
     )
+    if "three_paths_rmse_m" in row:
+        text += (
+            "\n"
+            + f"the paper's three paths: {row['three_paths_rmse_m']:5.0f} m, ".rjust(58)
+            + f"{_when(row['three_paths_settled_s'])}, worst {row['three_paths_worst_rmse_m']:.0f} m"
+        )
     if "told_rmse_m" in row:
         text += f"; told the labels {row['told_rmse_m']:.0f} m, {_when(row['told_settled_s'])}"
     return text
@@ -70,7 +77,7 @@ def _statements(result: Result) -> list[str]:
             shares, count = result.heard(name)
             heard = "/".join(f"{share:.2f}" for share in shares)
             text.append(
-                f"{name}: the three pairs are heard in {heard} of the scans, {count:.1f} delays a scan."
+                f"{name}: the paper's three pairs are heard in {heard} of the scans, {count:.1f} delays a scan."
             )
         else:
             needed = [np.log(PLACES) / row["information_nats"] * SCAN_S for row in settings.values()]
@@ -136,8 +143,8 @@ def _errors(axes: Axes, result: Result, name: str) -> None:
         axes.plot(scenario.time_s, rmse, color=colour, ls=dash, lw=1.6, label=f"setting ({label})")
     first = next(iter(result.tracks[name].values()))
     axes.plot(scenario.time_s, first.spread(), color="0.6", lw=1.2, label="filter's own std, (i)")
-    if scenario.sound is None:
-        told = np.sqrt(np.mean((first.told_m - scenario.range_m) ** 2, axis=0))
-        axes.plot(scenario.time_s, told, color="#009E73", lw=1.2, label="told the labels, (i)")
+    beside = np.sqrt(np.mean((first.beside_m - scenario.range_m) ** 2, axis=0))
+    label = "the paper's three paths, (i)" if scenario.sound else "told the labels, (i)"
+    axes.plot(scenario.time_s, beside, color="#009E73", lw=1.2, label=label)
     axes.set_yscale("log")
     axes.set_ylim(1, 3000)

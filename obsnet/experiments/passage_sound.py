@@ -121,13 +121,19 @@ def record(
     return pressure
 
 
-def detect(
-    pressure: np.ndarray,
-    time_s: np.ndarray,
-    sound: Sound,
-    tdoa_s: tuple[float, float],
-) -> list[np.ndarray | None]:
-    """Delays detected in a record [s], scan by scan; None where there is no scan.
+@dataclass(frozen=True)
+class Heard:
+    """Delays detected in a record [s], scan by scan, None where there is no scan; and the cepstral amplitude,
+    dims (quefrency,), that a peak must exceed to be detected at each quefrency [s].
+    """
+
+    scans: list[np.ndarray | None]
+    quefrency_s: np.ndarray
+    floor: np.ndarray
+
+
+def detect(pressure: np.ndarray, time_s: np.ndarray, sound: Sound, tdoa_s: tuple[float, float]) -> Heard:
+    """Delays detected in a record.
 
     The mean cepstrum of the record is subtracted (Ferguson et al. 2019), which takes the source's own spectrum away.
     """
@@ -153,7 +159,8 @@ def detect(
     found = detect_tdoas(values, quefrency[kept], middle - scan_s / 2, config)
     scans = {round(float(at) / scan_s): i for i, at in enumerate(found.times_s)}
     wanted = [round(float(at - time_s[0]) / scan_s) for at in time_s]
-    return [found.scan(scans[number]) if number in scans else None for number in wanted]
+    listed = [found.scan(scans[number]) if number in scans else None for number in wanted]
+    return Heard(listed, found.quefrency_s, found.floor)
 
 
 def _cepstra(pressure: np.ndarray, rate: float, nperseg: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

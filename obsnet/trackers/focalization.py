@@ -323,7 +323,7 @@ class FocalizationFilter:
         self, states: np.ndarray, measured: np.ndarray, receiver_depth_m: float | None
     ) -> tuple[np.ndarray, np.ndarray]:
         predicted = self.model.tdoas(states[:, RANGE], states[:, DEPTH], receiver_depth_m)
-        detection = self._detection * self.model.visibility(states[:, RANGE])
+        detection = self._detection * self.model.visibility(states[:, RANGE], receiver_depth_m)
         window = (self.config.min_tdoa_s, self.config.max_tdoa_s)
         return association_log_likelihood(
             predicted, measured, detection, self._std, self._clutter.density(measured), window

@@ -1,7 +1,7 @@
 """Where a source is in; which delays its paths predict, and how likely a set of measured delays is, out.
 
-Paths come from the image method in a shallow waveguide or from a propagation table; measured delays carry no
-label, so their likelihood sums over every valid assignment of measurements to pairs of paths.
+Paths come from a propagation table here, from the image method in `waveguide`; measured delays carry no label,
+so their likelihood sums over every valid assignment of measurements to pairs of paths.
 """
 
 from __future__ import annotations
@@ -18,24 +18,12 @@ from obsnet.errors import ConfigError
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import strongest_delay, tdoa
 
-IMAGE_DEPTHS = {
-    "direct": (0, 1),
-    "surface": (0, -1),
-    "bottom": (2, -1),
-    "surface-bottom": (-2, 1),
-    "bottom-surface": (2, 1),
-    "surface-bottom-surface": (-2, -1),
-    "bottom-surface-bottom": (4, -1),
-}
-"""Depth of the receiver's image for each path, as (multiple of the water depth, multiple of the receiver's
-depth); a path's name lists its reflections from the source on."""
-
 LEAST_VISIBILITY = 0.02
 
 UNDERFLOW_SIGMAS = 38.6
 """exp(−x²/2) is zero in double precision beyond this many standard deviations."""
 
-NEGLIGIBLE_SIGMAS = 11.0
+NEGLIGIBLE_SIGMAS = 9.0
 """A detection this far off adds less than rounding to a sum in which every pair may also have been missed."""
 
 NEVER_SIGMAS = 9.0
@@ -51,75 +39,11 @@ class TdoaModel(Protocol):
         """Delays [s], dims (source, pair); NaN where one of the paths cannot exist."""
         ...
 
-    def visibility(self, range_m: np.ndarray) -> np.ndarray:
+    def visibility(self, range_m: np.ndarray, receiver_depth_m: float | None) -> np.ndarray:
         """Factor of each pair's probability of detection, 0 to 1, dims (source, pair), or 1 where it is the
         same all over.
         """
         ...
-
-
-class ImageModel:
-    """Delays in a waveguide of constant depth and sound speed, by the image method.
-
-    Path k has the length q_k = √((p − i_k)² + r²), p the source's depth, i_k that of the receiver's image;
-    the delay of a pair is |q_a − q_b|/c. A source above the surface, below the bottom, or at a negative range
-    has no paths.
-
-    Parameters
-    ----------
-    water_depth_m, sound_speed_mps : m, m/s, positive.
-    paths : names out of `IMAGE_DEPTHS`; every two of them make a pair, ordered (0, 1), (0, 2), (1, 2).
-
-    Raises
-    ------
-    ConfigError
-        A path is unknown or named twice, or a size is not positive.
-
-    Source: Watkins et al., eq. (2) and fig. 1.
-
-    >>> model = ImageModel(65.0, 1508.0)
-    >>> model.pairs
-    ('direct,bottom', 'direct,bottom-surface', 'bottom,bottom-surface')
-    """
-
-    def __init__(
-        self,
-        water_depth_m: float,
-        sound_speed_mps: float,
-        paths: Sequence[str] = ("direct", "bottom", "bottom-surface"),
-    ) -> None:
-        for name, value in {"water depth": water_depth_m, "sound speed": sound_speed_mps}.items():
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"the {name} must be positive, found {value}")
-        unknown = [path for path in paths if path not in IMAGE_DEPTHS]
-        if unknown:
-            raise ConfigError(f"unknown path '{unknown[0]}'; the known ones are {', '.join(IMAGE_DEPTHS)}")
-        if len(paths) < 2 or len(set(paths)) < len(paths):
-            raise ConfigError(f"delays need two different paths at least, found {list(paths)}")
-        self.water_depth_m, self.sound_speed_mps = float(water_depth_m), float(sound_speed_mps)
-        self.paths = tuple(paths)
-        self._first, self._second = np.triu_indices(len(self.paths), k=1)
-        self.pairs = tuple(
-            f"{self.paths[a]},{self.paths[b]}" for a, b in zip(self._first, self._second, strict=True)
-        )
-
-    def tdoas(self, range_m: np.ndarray, depth_m: np.ndarray, receiver_depth_m: float | None) -> np.ndarray:
-        """Delays [s], dims (source, pair)."""
-        if receiver_depth_m is None or not 0.0 <= receiver_depth_m <= self.water_depth_m:
-            raise ConfigError(
-                f"the receiver's depth must lie in the water, 0 to {self.water_depth_m} m, "
-                f"found {receiver_depth_m}"
-            )
-        factors = np.array([IMAGE_DEPTHS[path] for path in self.paths], float)
-        images = factors @ np.array([self.water_depth_m, receiver_depth_m])
-        range_m, depth_m = np.asarray(range_m, float), np.asarray(depth_m, float)
-        lengths = np.sqrt((depth_m[:, None] - images) ** 2 + range_m[:, None] ** 2)
-        lengths[(range_m < 0) | (depth_m < 0) | (depth_m > self.water_depth_m)] = np.nan
-        return np.abs(lengths[:, self._first] - lengths[:, self._second]) / self.sound_speed_mps
-
-    def visibility(self, range_m: np.ndarray) -> np.ndarray:
-        """1: detection probabilities do not depend on position, as in the paper."""
-        return np.ones((1, len(self.pairs)))
 
 
 class TableModel:
@@ -169,7 +93,7 @@ class TableModel:
         """Delays [s], dims (source, pair); the depths are the table's own and not asked for."""
         return interpolate_uniform(np.asarray(range_m, float), self._curves, self.range_step_m)
 
-    def visibility(self, range_m: np.ndarray) -> np.ndarray:
+    def visibility(self, range_m: np.ndarray, receiver_depth_m: float | None = None) -> np.ndarray:
         """Factor of each pair's probability of detection, dims (source, pair)."""
         return interpolate_uniform(np.asarray(range_m, float), self._seen, self.range_step_m)
 
@@ -216,9 +140,10 @@ def association_log_likelihood(
 
     Notes
     -----
-    The sum is exact. Taking the measurements one by one and keeping, for each of the 2^L sets of pairs
-    already served, the sum over the assignments that serve just this set visits every valid vector once,
-    without listing them.
+    The sum is exact to rounding. Measurements are taken in the order of their delays, and for each set of pairs
+    already served the sum over the assignments that serve just this set is kept, which visits every valid
+    vector once without listing it. A pair is in these sets from the first to the last measurement that can be
+    its own only: with L of them open at once, a measurement costs 2^L L steps.
 
     Source: Watkins et al., eq. (3).
     """
@@ -228,9 +153,10 @@ def association_log_likelihood(
     )
     std = np.ascontiguousarray(np.broadcast_to(std_s, predicted.shape[1:]), dtype=np.float64)
     low, high = window_s
-    measured = np.ascontiguousarray(measured_s, dtype=np.float64)
-    density = np.ascontiguousarray(np.broadcast_to(false_alarm_density, measured.shape), dtype=np.float64)
-    return _sum_associations(predicted, measured, detection, std, density, low, high)
+    unsorted = np.asarray(measured_s, dtype=np.float64)
+    order = np.argsort(unsorted)
+    density = np.broadcast_to(false_alarm_density, unsorted.shape).astype(np.float64)[order]
+    return _sum_associations(predicted, unsorted[order], detection, std, density, low, high)
 
 
 @njit(cache=True, nogil=True)
@@ -238,71 +164,75 @@ def _sum_associations(predicted, measured, detection, std, density, low, high):
     n_source, n_pair = predicted.shape
     log_ratio = np.empty(n_source)
     expected = np.empty(n_source)
-    served = np.empty(1 << n_pair)
-    rest = np.empty(1 << n_pair)
-    miss = np.empty(n_pair)
-    ratio = np.empty(n_pair)
-    close = np.empty(n_pair, np.int64)
-    precision = 1.0 / std
-    peak = precision / np.sqrt(2.0 * np.pi)
+    served, counted = np.empty(1 << n_pair), np.empty(1 << n_pair)
+    miss, ratio = np.empty(n_pair), np.empty(n_pair)
+    first, stop = np.empty(n_pair, np.int64), np.empty(n_pair, np.int64)
+    opened = np.empty(n_pair, np.int64)
     for j in range(n_source):
-        reach, total, weighted = NEGLIGIBLE_SIGMAS, 1.0, 0.0
+        factor = 1.0
         for pair in range(n_pair):
-            miss[pair] = 1.0
+            first[pair], stop[pair], miss[pair] = 0, 0, 1.0
             if not np.isnan(predicted[j, pair]):
                 miss[pair] -= detection[j, pair] * _inside(predicted[j, pair], std[pair], low, high)
-            total *= miss[pair]
-            if miss[pair] < 1e-3:
-                reach = UNDERFLOW_SIGMAS
-        anything = False
+                reach = std[pair] * (NEGLIGIBLE_SIGMAS if miss[pair] > 1e-3 else UNDERFLOW_SIGMAS)
+                first[pair] = np.searchsorted(measured, predicted[j, pair] - reach)
+                stop[pair] = np.searchsorted(measured, predicted[j, pair] + reach)
+            if first[pair] == stop[pair]:
+                factor *= miss[pair]
+        n_open, served[0], counted[0] = 0, factor, 0.0
         for m in range(len(measured)):
-            n_close = 0
             for pair in range(n_pair):
-                distance = (measured[m] - predicted[j, pair]) * precision[pair]
-                if abs(distance) < reach:
-                    rate = detection[j, pair] * peak[pair] / density[m]
-                    ratio[n_close] = rate * np.exp(-0.5 * distance * distance)
-                    close[n_close] = 1 << pair
-                    n_close += 1
-            if n_close > 0:
-                if not anything:
-                    served[:] = 0.0
-                    served[0] = 1.0
-                    anything = True
-                _serve(served, close, ratio, n_close)
-        if anything:
-            total, weighted = _collect(served, miss, rest)
-        log_ratio[j] = np.log(total) if total > 0.0 else -np.inf
-        expected[j] = weighted / total if total > 0.0 else 0.0
+                if first[pair] == m and stop[pair] > m:
+                    _open(served, counted, n_open)
+                    opened[n_open] = pair
+                    n_open += 1
+            if n_open == 0:
+                continue
+            for i in range(n_open):
+                pair = opened[i]
+                distance = (measured[m] - predicted[j, pair]) / std[pair]
+                rate = detection[j, pair] / (np.sqrt(2.0 * np.pi) * std[pair] * density[m])
+                ratio[i] = rate * np.exp(-0.5 * distance * distance)
+            _serve(served, counted, ratio, n_open)
+            for i in range(n_open - 1, -1, -1):
+                if stop[opened[i]] == m + 1:
+                    n_open -= 1
+                    _close(served, counted, miss[opened[i]], i, n_open)
+                    for later in range(i, n_open):
+                        opened[later] = opened[later + 1]
+        log_ratio[j] = np.log(served[0]) if served[0] > 0.0 else -np.inf
+        expected[j] = counted[0] / served[0] if served[0] > 0.0 else 0.0
     return log_ratio, expected
 
 
 @njit(cache=True, nogil=True)
-def _serve(served, close, ratio, n_close):
-    for chosen in range(len(served) - 1, 0, -1):
-        for i in range(n_close):
-            if chosen & close[i]:
-                served[chosen] += ratio[i] * served[chosen ^ close[i]]
+def _open(served, counted, n_open):
+    """One pair more, not yet served."""
+    served[1 << n_open : 2 << n_open] = 0.0
+    counted[1 << n_open : 2 << n_open] = 0.0
 
 
 @njit(cache=True, nogil=True)
-def _collect(served, miss, rest):
-    last = len(served) - 1
-    rest[last] = 1.0
-    total, weighted = served[last], len(miss) * served[last]
-    for chosen in range(last - 1, -1, -1):
-        left_out = 0
-        while chosen >> left_out & 1:
-            left_out += 1
-        rest[chosen] = rest[chosen | 1 << left_out] * miss[left_out]
-        term = served[chosen] * rest[chosen]
-        total += term
-        if term > 0.0:
-            count = 0
-            for pair in range(len(miss)):
-                count += chosen >> pair & 1
-            weighted += count * term
-    return total, weighted
+def _serve(served, counted, ratio, n_open):
+    """The next measurement is false, or serves one of the open pairs."""
+    for chosen in range((1 << n_open) - 1, 0, -1):
+        total, weighted = served[chosen], counted[chosen]
+        for i in range(n_open):
+            if chosen >> i & 1:
+                before = chosen ^ (1 << i)
+                total += ratio[i] * served[before]
+                weighted += ratio[i] * (counted[before] + served[before])
+        served[chosen], counted[chosen] = total, weighted
+
+
+@njit(cache=True, nogil=True)
+def _close(served, counted, miss, place, n_open):
+    """No later measurement can serve the pair at this place: what is not served is missed."""
+    for rest in range(1 << n_open):
+        without = (rest >> place << (place + 1)) | (rest & ((1 << place) - 1))
+        chosen = without | (1 << place)
+        served[rest] = miss * served[without] + served[chosen]
+        counted[rest] = miss * counted[without] + counted[chosen]
 
 
 @njit(cache=True, nogil=True)

@@ -96,6 +96,8 @@ class TdoaDetections:
     scan_of : array of int, dims (detection,), index of the detection's scan, not decreasing.
     tdoa_s : array, dims (detection,), s.
     prominence : array, dims (detection,), amplitude over the background's median.
+    quefrency_s, floor : arrays, dims (quefrency,): the delays looked for, s, and the amplitude that a peak must
+        exceed there, median over the scans.
     """
 
     times_s: np.ndarray
@@ -103,6 +105,8 @@ class TdoaDetections:
     scan_of: np.ndarray
     tdoa_s: np.ndarray
     prominence: np.ndarray
+    quefrency_s: np.ndarray
+    floor: np.ndarray
 
     def scan(self, index: int) -> np.ndarray | None:
         """Delays [s] of the scan with this index; None in a gap."""
@@ -152,12 +156,16 @@ def detect_tdoas(
     scan_times, valid, envelope = scan_envelope(values, step, times, config)
     half_rows = max(1, round(config.background_tdoa_s / 2 / step))
     median = running_median(envelope, scan_times, valid, half_rows, config.background_time_s / 2, first, stop)
-    rows, scans, shift = _peaks(envelope, median * config.threshold, valid, first, stop)
+    floor = median * config.threshold
+    rows, scans, shift = _peaks(envelope, floor, valid, first, stop)
     tdoa = quefrency[rows] + shift * step
     points = np.stack([tdoa / config.cluster_tdoa_s, scan_times[scans] / config.cluster_time_s], axis=1)
     kept = dbscan(points, 1.0, config.cluster_points) != NOISE
     prominence = envelope[rows, scans] / median[rows - first, scans]
-    return TdoaDetections(scan_times, valid, scans[kept], tdoa[kept], prominence[kept])
+    usual = np.median(floor[:, valid], axis=1) if valid.any() else np.full(stop - first, np.nan)
+    return TdoaDetections(
+        scan_times, valid, scans[kept], tdoa[kept], prominence[kept], quefrency[first:stop], usual
+    )
 
 
 def scan_envelope(

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,12 +7,14 @@ import pytest
 from obsnet.errors import ConfigError
 from obsnet.experiments.focalization import (
     MAX_TDOA_S,
+    MIN_DETECTED_S,
     SCENARIOS,
     SOUND_SPEED_MPS,
     TDOA_STD_S,
     Setting,
     ToldFilter,
     filter_config,
+    fitted,
     follow,
     information_nats,
     mixed,
@@ -82,7 +85,9 @@ def test_the_boats_listed_rates_cannot_settle_within_seconds_but_the_ships_can()
 
 def test_range_settles_within_seconds_from_sound_with_every_listed_setting(result):
     for row in result.to_json()["kraken"].values():
-        assert row["settled_s"] is not None and row["settled_s"] <= 15.0
+        # Eight pairs fit a boat's first scans at more places than the paper's three, which settle within 15 s.
+        assert row["settled_s"] is not None and row["settled_s"] <= 30.0
+        assert row["three_paths_settled_s"] is not None and row["three_paths_settled_s"] <= 15.0
         assert row["range_rmse_m"] < 10.0 and row["simulated"] is True
     shares, count = result.heard("kraken")
     assert (shares > 0.5).all() and 3.0 < count < 12.0
@@ -93,6 +98,30 @@ def test_range_settles_at_listed_rates_and_sooner_with_the_labels(result):
         assert row["settled_s"] is not None and row["settled_s"] < 120.0
         assert row["told_settled_s"] <= row["settled_s"]
         assert row["told_rmse_m"] < 1.5 * row["range_rmse_m"] < 150.0
+
+
+def test_false_alarms_are_what_the_scans_hold_beyond_the_expected():
+    scans = [np.zeros(5), None, np.zeros(3)]
+    made = fitted(Setting((0.4, 0.3, 0.2), 1.0), 5, scans)
+    assert made.detection_probability == (0.4, 0.3, 0.2, 0.1, 0.1)
+    assert made.false_alarms == pytest.approx(4.0 - 1.1)
+    assert fitted(Setting((0.9,), 1.0), 1, [np.zeros(0)]).false_alarms == pytest.approx(0.1)
+
+
+def test_a_second_bounce_holds_the_ship_where_the_direct_sound_is_lost():
+    """Source, depths and seed of no run of the experiment."""
+    ship = SCENARIOS["marfret"]
+    sound = replace(ship.sound, source_level_db=128.0, source_depth_m=3.5)
+    part = replace(ship, along_m=(300.0, 2000.0), receiver_depth_m=(22.0, 16.0), sound=sound)
+    heard, setting = part.recorded(41), part.settings["ii"]
+    model = part.model(heard)
+    config = filter_config(fitted(setting, len(model.pairs), heard.scans), 3000, 0, MIN_DETECTED_S)
+    found, _ = follow(part, heard.scans, config, model=model)
+    three, _ = follow(part, heard.scans, filter_config(setting, 3000, 0, MIN_DETECTED_S))
+    late = part.time_s > 30.0
+    error, other = (np.abs(track - part.range_m)[late] for track in (found, three))
+    assert np.median(error) < 60.0 and error.max() < 300.0
+    assert error.mean() < 0.5 * other.mean()
 
 
 def test_labels_leave_the_error_that_the_delays_allow():
@@ -113,7 +142,7 @@ def test_sound_holds_the_delays_of_the_image_method():
     loud = Sound(source_level_db=140.0, source_depth_m=1.0)
     sound = record(time, distance, receiver, water, SOUND_SPEED_MPS, loud, (1,))
     assert len(sound) == 90 * loud.sampling_rate
-    scans = detect(sound, time, loud, (0.001, MAX_TDOA_S))
+    scans = detect(sound, time, loud, (0.001, MAX_TDOA_S)).scans
     lengths = [np.hypot(distance, image) for image in (30.0, 2 * water - 30.0, 2 * water + 30.0)]
     for first, second in ((0, 1), (0, 2), (1, 2)):
         delay = (lengths[second] - lengths[first]) / SOUND_SPEED_MPS

@@ -6,7 +6,8 @@ from scipy.stats import norm
 
 from obsnet.errors import ConfigError, FilterError, LayoutError
 from obsnet.trackers.focalization import FocalizationConfig, FocalizationFilter
-from obsnet.trackers.tdoa_association import ImageModel, association_log_likelihood
+from obsnet.trackers.tdoa_association import association_log_likelihood
+from obsnet.trackers.waveguide import ImageModel
 
 INF = np.inf
 PAPER = FocalizationConfig(
@@ -38,7 +39,7 @@ class Linear:
     def tdoas(self, range_m, depth_m, receiver_depth_m):
         return self.slope * np.asarray(range_m)[:, None]
 
-    def visibility(self, range_m):
+    def visibility(self, range_m, receiver_depth_m):
         return np.ones((1, 1))
 
 
@@ -214,7 +215,7 @@ def test_jumps_get_the_filter_off_a_ghost():
         def tdoas(self, range_m, depth_m, receiver_depth_m):
             return np.stack([1e-3 * range_m, 0.5e-3 * range_m + 0.2], axis=1)
 
-        def visibility(self, range_m):
+        def visibility(self, range_m, receiver_depth_m):
             return np.ones((1, 2))
 
     def final_range(jump_s):

@@ -3,12 +3,11 @@ from itertools import product
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.optimize import minimize
 from scipy.stats import norm
 
 from obsnet.errors import ConfigError, LayoutError
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.trackers.tdoa_association import ImageModel, TableModel, association_log_likelihood
+from obsnet.trackers.tdoa_association import TableModel, association_log_likelihood
 
 
 def enumerate_associations(predicted, measured, detection, std, density, window):
@@ -72,7 +71,7 @@ def test_order_of_measurements_and_of_pairs_does_not_matter():
     second, _ = association_log_likelihood(
         predicted[:, order], measured[::-1], detection[order], std[order], 3.0, (0.0, 1.0)
     )
-    np.testing.assert_allclose(first, second, rtol=1e-12)
+    np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-12)
 
 
 def test_certain_detection_that_is_missed_is_impossible():
@@ -80,67 +79,6 @@ def test_certain_detection_that_is_missed_is_impossible():
         np.array([[0.5]]), np.array([]), np.array([1.0]), np.array([0.01]), 1.0, (0.0, 1.0)
     )
     assert found[0] == -np.inf and served[0] == 0.0
-
-
-def shortest(source_depth, receiver_depth, range_m, surfaces):
-    """Length of the path that touches the given depths in turn: least time over the places where it does."""
-
-    def length(places):
-        x = np.concatenate([[0.0], places, [range_m]])
-        z = np.concatenate([[source_depth], surfaces, [receiver_depth]])
-        return np.hypot(np.diff(x), np.diff(z)).sum()
-
-    if not surfaces:
-        return length([])
-    start = np.linspace(0, range_m, len(surfaces) + 2)[1:-1]
-    return minimize(length, start, method="BFGS", options={"gtol": 1e-9}).fun
-
-
-def test_image_delays_are_those_of_the_shortest_reflected_paths():
-    water, receiver, source, distance, speed = 65.0, 22.0, 9.0, 140.0, 1508.0
-    reflections = {
-        "direct": [],
-        "surface": [0.0],
-        "bottom": [water],
-        "bottom-surface": [water, 0.0],
-        "surface-bottom": [0.0, water],
-        "surface-bottom-surface": [0.0, water, 0.0],
-        "bottom-surface-bottom": [water, 0.0, water],
-    }
-    paths = tuple(reflections)
-    times = {p: shortest(source, receiver, distance, reflections[p]) / speed for p in paths}
-    model = ImageModel(water, speed, paths)
-    found = model.tdoas(np.array([distance]), np.array([source]), receiver)[0]
-    assert len(found) == 21
-    for pair, delay in zip(model.pairs, found, strict=True):
-        first, second = pair.split(",")
-        assert delay == pytest.approx(abs(times[first] - times[second]), abs=1e-8)
-
-
-def test_no_paths_from_outside_the_water():
-    model = ImageModel(65.0, 1508.0)
-    delays = model.tdoas(np.array([-1.0, 100.0, 100.0, 100.0]), np.array([0.0, -1.0, 66.0, 65.0]), 20.0)
-    np.testing.assert_array_equal(np.isnan(delays).all(axis=1), [True, True, True, False])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((0.0, 1500.0), "water depth must be positive"),
-        ((65.0, np.nan), "sound speed must be positive"),
-        ((65.0, 1500.0, ("direct", "botom")), "unknown path 'botom'"),
-        ((65.0, 1500.0, ("direct", "direct")), "two different paths"),
-    ],
-)
-def test_bad_waveguides_are_refused(arguments, message):
-    with pytest.raises(ConfigError, match=message):
-        ImageModel(*arguments)
-
-
-@pytest.mark.parametrize("depth", [None, -1.0, 66.0, np.nan])
-def test_a_receiver_out_of_the_water_is_refused(depth):
-    with pytest.raises(ConfigError, match="receiver's depth must lie in the water"):
-        ImageModel(65.0, 1508.0).tdoas(np.array([100.0]), np.array([0.0]), depth)
 
 
 def table(depth=4340.0, speed=1500.0, reach_m=None):
