@@ -315,10 +315,7 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         speed_std_mps=2.0,
         delay=delay,
     )
-    if found is None or found.end - found.start < BEARINGS_SHORTEST_S:
-        return []
-    moves = found.extra["log_bayes_factor_fixed"] >= run.config.grid_search.min_log_bayes_factor
-    return [found] if moves else []
+    return [found] if found is not None and found.end - found.start >= BEARINGS_SHORTEST_S else []
 
 
 class _MemorySink:

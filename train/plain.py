@@ -1,6 +1,7 @@
-"""Records of a third generator, and how obsnet does on them: image sources in water of one speed, little else.
+"""Records of a third generator: image sources in water of one speed, little else.
 
-    python train/plain.py --folder DIR [--passages 24] [--silent 8] [--seed 1001] [--set segmentation.average_min=[120]]
+    python train/plain.py --folder DIR [--passages 30] [--silent 12] [--seed 1001]
+    python train/score.py DIR/passages_*
 
 It shares nothing with the twin nor with `elsewhere`: straight rays, a bottom that gives back one share of the sound whatever the
 angle, noise of one slope. Many ships are faint, pass quickly or overhead, or pass together, so that short and masked passages
@@ -222,56 +223,20 @@ def write(scene: Scene, folder: Path) -> None:
 
 
 def main() -> None:
-    """Make the records, track them, print how many ships were found, missed and false."""
-    import obsnet
-    from obsnet.ais import read, reference_tracks
-    from obsnet.config import build, merge_overrides
-    from obsnet.evaluation import evaluate
-    from obsnet.pipeline import RunConfig
-
+    """Make the records that are not there."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--passages", type=int, default=24, help="records with ships")
-    parser.add_argument("--silent", type=int, default=8, help="records without")
+    parser.add_argument("--passages", type=int, default=30, help="records with ships, four hours each")
+    parser.add_argument("--silent", type=int, default=12, help="records without, six hours each")
     parser.add_argument("--seed", type=int, default=1001)
-    parser.add_argument("--set", action="append", default=[], help="section.key=value, as of obsnet track")
     given = parser.parse_args()
-    config = build(RunConfig, merge_overrides({}, given.set))
-    kinds = {"passages": (given.passages, False), "silent": (given.silent, True)}
-    for kind, (count, silent) in kinds.items():
-        counts = dict.fromkeys(("ships", "found", "false"), 0)
-        errors, hours = [], 0.0
+    for kind, count in (("passages", given.passages), ("silent", given.silent)):
         for seed in range(given.seed, given.seed + count):
             folder = given.folder / f"{kind}_{seed}"
             if not (folder / "scene.json").exists():
-                write(draw(seed, silent), folder)
-            station = obsnet.Station.from_stationxml(folder / "station.xml")
-            run = obsnet.track(folder / "waveforms.mseed", station, config=config)
-            hours += draw(seed, silent).hours
-            if silent:
-                counts["false"] += len(run.tracks)
-                continue
-            where = (station.latitude, station.longitude)
-            said = evaluate(
-                run.detections,
-                run.tracks,
-                reference_tracks(read(folder / "ais.csv", near=where), where),
-                run.delay,
-            )
-            found = [ship for ship in said.ships if ship.number and ship.track is not None]
-            counts["ships"] += len(found) + len(said.missed)
-            counts["found"] += len(found)
-            counts["false"] += len(said.false_tracks)
-            errors += [(s.cpa_time_error_s, s.cpa_distance_error_m, s.course_error_deg) for s in found]
-        line = f"{kind}: {count} simulated records, {hours:g} h; " + ", ".join(
-            f"{n} {k}" for k, n in counts.items()
-        )
-        if errors:
-            time_s, distance_m, course_deg = np.median(np.abs(errors), axis=0)
-            line += f"; medians of the errors {time_s:.0f} s, {distance_m:.0f} m, {course_deg:.1f}°"
-        print(line, flush=True)
+                write(draw(seed, kind == "silent"), folder)
 
 
 if __name__ == "__main__":

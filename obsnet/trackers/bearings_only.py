@@ -22,7 +22,7 @@ from obsnet.trackers.track import Track
 
 Delay = Callable[[np.ndarray], np.ndarray]
 MOST_PASSES = 40
-FIXED_ODDS = 3.0
+FIXED_ODDS = 10.0
 """Log odds that a passing ship must have over a fixed direction; noise from one side is common."""
 
 
