@@ -45,6 +45,7 @@ def track(
     tracking: bool = True,
 ) -> None:
     """Read waveforms, station and parameters; run; put the run's files into `out` and say what was found."""
+    console.keep_memory()
     with console.loading():
         import obsnet.run as runs
         from obsnet.output import staged

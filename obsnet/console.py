@@ -19,6 +19,9 @@ from typing import NoReturn
 
 from obsnet.errors import OutputError
 
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Parameters of glibc's `mallopt`, as malloc.h numbers them."""
+
 _wishes: list[int] = []
 """Signals to stop that this process has been sent; like its handlers, they belong to the process."""
 
@@ -86,6 +89,18 @@ def loading() -> Iterator[None]:
         gc.freeze()
         if collects:
             gc.enable()
+
+
+def keep_memory() -> None:
+    """Have glibc, where it is the allocator, keep what arrays of some MB leave: else every one that comes is faulted in anew."""
+    import ctypes
+
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    for parameter, size in ((_MMAP_THRESHOLD, 1 << 25), (_TRIM_THRESHOLD, 1 << 29)):
+        mallopt(parameter, size)
 
 
 def say(text: str) -> None:

@@ -1,6 +1,7 @@
 """The command as a process: what it imports, and how it ends when it is interrupted, unheard or out of room."""
 
 import os
+import platform
 import re
 import resource
 import shutil
@@ -207,3 +208,21 @@ except SystemExit:
 print(os.environ.get("OPENBLAS_NUM_THREADS"))
 """
     assert python(code).stdout.split()[-1] == threads
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc's allocator")
+def test_kept_memory_is_not_faulted_in_again():
+    code = """
+import resource, sys
+import numpy as np
+from obsnet.console import keep_memory
+if sys.argv[1] == "kept":
+    keep_memory()
+for _ in range(100):
+    one = np.ones(1 << 18)
+    two = 2.0 * one
+    del one, two
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+"""
+    faults = {how: int(python(code, how).stdout) for how in ("kept", "given back")}
+    assert faults["kept"] < 0.5 * faults["given back"]

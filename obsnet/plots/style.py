@@ -185,7 +185,7 @@ class Painting:
         new = [artist for artist in self._artists() if id(artist) not in self._painted]
         for artist in sorted(new, key=lambda artist: artist.get_zorder()):
             artist.draw(self._canvas.get_renderer())
-        pixels = self._canvas.buffer_rgba()
+        pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]
         return _write(path, lambda file, **how: imsave(file, pixels, format="png", dpi=DPI, **how))
 
 

@@ -218,7 +218,7 @@ class _Moment:
         return _Moment(self.count - other.count, self.moment - other.moment)
 
 
-def leading_basis(gram: np.ndarray, count: int, guess: int = 32) -> np.ndarray:
+def leading_basis(gram: np.ndarray, count: int, guess: int = 16) -> np.ndarray:
     """Orthonormal vectors over quefrency before the knee of the singular values.
 
     Parameters
@@ -247,7 +247,7 @@ def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.n
         return values[::-1][:size], vectors[:, ::-1][:, :size]
     single = matrix.astype(np.float32)
     basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8), np.float32)
-    for _ in range(5):
+    for _ in range(6):
         basis, _ = np.linalg.qr(single @ (single @ basis))
     basis = basis.astype(matrix.dtype)
     values, turn = np.linalg.eigh(basis.T @ matrix @ basis)
