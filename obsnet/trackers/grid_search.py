@@ -20,14 +20,7 @@ from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
 from obsnet.trackers.course_grid import CourseGrid, Delay, apart, best_first, score_points
 from obsnet.trackers.posterior import Posterior, posterior
-from obsnet.trackers.score_maps import (
-    ScoreMaps,
-    above_floor,
-    azimuth_scores,
-    lobe,
-    range_scores,
-    tiles,
-)
+from obsnet.trackers.score_maps import ScoreMaps, above_floor, azimuth_scores, lobe, range_scores, tiles
 from obsnet.trackers.track import Segment, Track
 
 
@@ -249,13 +242,10 @@ class _Finder:
             said = grid.scores(cells)
             values.flat[cells], headings.flat[cells] = said.max(axis=1), said.argmax(axis=1)
             found = apart(values, config.candidates)
-        return [
-            (
-                np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]),
-                float(values[t, i, j]),
-            )
-            for t, i, j in found
+        places = [
+            np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]) for t, i, j in found
         ]
+        return [(place, float(values[at])) for place, at in zip(places, found, strict=True)]
 
     def _level(
         self,
