@@ -35,7 +35,7 @@ from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
-from obsnet.trackers.track import Segment, Track
+from obsnet.trackers.track import USUAL_MPS, Segment, Track
 
 if TYPE_CHECKING:
     import obspy
@@ -311,8 +311,8 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         azimuth,
         5.0,
         correlation_s=config.window_s,
-        speed_mps=7.5,
-        speed_std_mps=2.0,
+        speed_mps=USUAL_MPS[0],
+        speed_std_mps=USUAL_MPS[1],
         delay=delay,
     )
     return [found] if found is not None and found.end - found.start >= BEARINGS_SHORTEST_S else []

@@ -216,6 +216,14 @@ def score_points(
     return best, per_tile
 
 
+def ranged(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps) -> float:
+    """Sum of what range maps say for a course, in the tiles in which it is heard and they do."""
+    _, both = score_points(point[None], tiles, delay, scores)
+    _, pointing = score_points(point[None], tiles, delay, scores.without_range())
+    first, last = best_run(both[:, 0])
+    return float(np.maximum(both - pointing, 0.0)[first : last + 1].sum())
+
+
 def _heard(
     heard: np.ndarray, points: np.ndarray, delay: Delay, reach_s: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -283,6 +291,15 @@ def _departed(
         side, sideways = side + swing * beyond, sideways + swing * (beyond != 0)
         ahead, forwards = ahead + less * beyond, forwards + less * (beyond != 0)
     return cpa_range + speed * side, speed * ahead, speed * sideways, speed * forwards
+
+
+def best_run(values: np.ndarray) -> tuple[int, int]:
+    """First and last index of the run of greatest sum."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    lowest = np.minimum.accumulate(total[:-1])
+    end = int(np.argmax(total[1:] - lowest))
+    start = int(np.argmin(total[: end + 1]))
+    return start, end
 
 
 def apart(values: np.ndarray, most: int) -> list[tuple[int, int, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -49,6 +49,10 @@ class ScoreMaps:
         n_rate = self.range_score.shape[2]
         ahead = np.maximum(self.flat[:, :-1], self.flat[:, 1:])
         return np.maximum(ahead[:, :-n_rate], ahead[:, n_rate:])
+
+    def without_range(self) -> ScoreMaps:
+        """The same with range maps that say nothing."""
+        return replace(self, range_score=np.zeros_like(self.range_score))
 
     def corner(self, range_m: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Index into `flat` of the grid point below in range and rate, and how far right and up of it, in grid steps."""

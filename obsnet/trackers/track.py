@@ -13,6 +13,15 @@ from obsnet.layout import from_posix, iso
 PARAMETERS = ("cpa_time_s", "cpa_range_m", "course_deg", "speed_mps")
 """Order of a track's covariance; the CPA range is signed (see `obsnet.kinematics`)."""
 
+USUAL_MPS = (7.5, 2.0)
+"""Mean and standard deviation [m/s] of the speeds of merchant ships, where bearings alone cannot tell speed from distance."""
+
+
+def usual(speed_mps: np.ndarray, spread_mps: float) -> np.ndarray:
+    """Log density of merchant ships' speeds over that of speeds spread evenly over so much."""
+    mean, std = USUAL_MPS
+    return np.log(spread_mps / (std * np.sqrt(2.0 * np.pi))) - 0.5 * ((speed_mps - mean) / std) ** 2
+
 
 @dataclass(frozen=True)
 class Segment:

@@ -273,3 +273,23 @@ def test_search_keeps_the_best_of_its_grid():
     few = search(maps, SEGMENT, delay, GridSearchConfig(candidates=1))[0]
     many = search(maps, SEGMENT, delay, GridSearchConfig(candidates=8))[0]
     assert many.extra["score"] >= few.extra["score"] - 1e-6
+
+
+def test_a_ship_whose_range_is_nowhere_heard_has_bearings_alone():
+    """Range maps that speak against every range, most against near ones, must not decide how far away and fast it is."""
+    rng = np.random.default_rng(7)
+    course = StraightCourse(T0 + 7200.0, 3_000.0, 60.0, 6.0)
+    minutes = T0 + 60.0 * np.arange(240)
+    maps = maps_of([course], minutes, rng, strength=10.0)
+    deaf = -1.0 - 2.0 * np.exp(-RANGE / 20_000.0) + 0.2 * rng.standard_normal(maps["range_llr"].shape[:2])
+    maps["range_llr"] = maps["range_llr"].copy(
+        data=np.repeat(deaf[..., None], len(RATE), axis=2).astype(np.float32)
+    )
+    (track,) = search(maps, Segment(minutes[0], minutes[-1]), delay)
+    assert "no range heard" in track.method
+    assert abs(track.motion.cpa_time - course.cpa_time) < 30.0
+    assert abs(wrap180(track.motion.course_deg - course.course_deg)) < 2.0
+    assert track.motion.cpa_range_m / track.motion.speed_mps == pytest.approx(500.0, rel=0.1)
+    assert abs(track.motion.speed_mps - 7.5) < 2.0
+    assert 1.0 < track.std[3] < 3.0
+    assert abs(track.motion.cpa_range_m - 3_000.0) < 2.0 * track.std[1] < 3_000.0
