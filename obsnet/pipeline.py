@@ -181,6 +181,8 @@ class Pipeline:
             self._azigram = self._null = self._cepstrogram = self._spectrogram = self._next = None
             if self._learned is not None:
                 self._learned.reset()
+        if self.config.tracker == "bernoulli" and not set(spectra) >= {*_HORIZONTALS, "p"}:
+            raise needs_full_azimuths(self.station)
         if self._next is None:
             first = max(times[0], self.begin)
             self._next = float(np.ceil(first / self.config.azimuth.step_s) * self.config.azimuth.step_s)
@@ -411,6 +413,14 @@ class Pipeline:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+
+
+def needs_full_azimuths(station: Station) -> ConfigError:
+    """What to say where the bernoulli tracker has no full azimuths to follow."""
+    return ConfigError(
+        f"the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; {station.code} does not offer "
+        "them: use --tracker grid"
+    )
 
 
 def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

@@ -262,6 +262,20 @@ def test_no_hydrophone_is_azimuth_by_polarisation(tracked, inventory, tmp_path):
     assert off.abs().max() < 30
 
 
+def test_what_the_bernoulli_tracker_cannot_follow_is_not_read(
+    obsnet, record, inventory, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("obsnet.pipeline.Pipeline._begin", lambda *given: pytest.fail("went on"))
+    station = only(inventory, tmp_path / "s.xml", "BH1", "BH2", "BHZ")
+    status, _, errors = obsnet(
+        "track", record / "waveforms.mseed", "--station", station, "--out", tmp_path / "o", "--tracker", "bernoulli"
+    )  # fmt: skip
+    assert status == 2
+    (line,) = errors
+    assert "which need two horizontals and a hydrophone" in line
+    assert not (tmp_path / "o").exists()
+
+
 def test_no_response_is_said(tracked, inventory, tmp_path):
     def bare(channel):
         channel.response = None
