@@ -216,16 +216,11 @@ def evaluate(
         bool, typer.Option("--merchant-only", help="Cargo ships and tankers alone.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Print the core paper's Table I for a run, against AIS."""
-    commands.evaluate(
-        folder,
-        ais,
-        as_json=as_json,
-        max_cpa_m=1e3 * max_cpa,
-        max_range_m=1e3 * max_range,
-        merchant_only=merchant_only,
-    )
+    limits = {"max_cpa_m": 1e3 * max_cpa, "max_range_m": 1e3 * max_range}
+    commands.evaluate(folder, ais, quiet, as_json, merchant_only=merchant_only, **limits)
 
 
 @app.command()
@@ -463,6 +458,7 @@ def plot(
         int | None, typer.Option("--figure", help="The core paper's figure 3, 5, 6, 7 or 8 (all by default).")
     ] = None,
     ais: AisFile = None,
+    quiet: Quiet = False,
 ) -> None:
     """Draw the core paper's figures from any run."""
     from obsnet.plots import FIGURES, draw
@@ -470,7 +466,8 @@ def plot(
     if figure is not None and figure not in FIGURES:
         raise ConfigError(f"no figure {figure}; choose one of {', '.join(map(str, FIGURES))}")
     for path in draw(folder, [figure] if figure else list(FIGURES), ais):
-        console.say(str(path))
+        if not quiet:
+            console.say(str(path))
 
 
 models = typer.Typer(help="What a learned detector's file is, and whether it can be trusted.")

@@ -338,6 +338,7 @@ def test_evaluate_reads_what_was_written(obsnet, record, finished):
     assert (status, errors) == (0, [])
     (ship,) = json.loads(told[0])["ships"]
     assert abs(ship["cpa_time_error_s"]) < 60
+    assert obsnet("evaluate", finished, "--ais", record / "ais.csv", "--quiet") == (0, [], [])
 
 
 def test_a_run_in_python_keeps_blas_to_one_thread(stream, inventory):
