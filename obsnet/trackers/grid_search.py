@@ -203,11 +203,12 @@ class _Finder:
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
         coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
-        starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
+        needed = (least + self._runs) / self.config.exponent
+        starts = self._coarse(coarse, needed)
         if not starts:
             return None
         fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
-        best, point = 0.0, None
+        best, point = COARSE_SHARE * needed, None
         for start, score in starts:
             if best < GAIN[0] * score + GAIN[1]:
                 best, point = self._level(start, MEDIUM, fine, best, point)
@@ -215,7 +216,7 @@ class _Finder:
             return None
         best, point = self._level(point, FINE, fine)
         # The evidence is less than the greatest likelihood, by far more than what a finer grid would find.
-        if point is None or self.config.exponent * best - self._runs < least:
+        if point is None or best < needed:
             return None
         return self._track(point, fine)
 
@@ -395,13 +396,8 @@ class _Finder:
         long_enough = track.end - track.start >= config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
         located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
-        return (
-            long_enough
-            and within_speed
-            and within_range
-            and located
-            and track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
-        )
+        moves = track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
+        return bool(long_enough and within_speed and within_range and located and moves)
 
     def required(self, track: Track, others: Sequence[Track]) -> float:
         """The log Bayes factor that a track must reach beside what else is known."""
