@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 _HORIZONTALS = {"east", "north"}
 
+NEEDS_FULL_AZIMUTHS = "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
+
 _STRETCH = 30
 """Minutes whose maps are made at a time."""
 
@@ -182,7 +184,7 @@ class Pipeline:
             if self._learned is not None:
                 self._learned.reset()
         if self.config.tracker == "bernoulli" and not set(spectra) >= {*_HORIZONTALS, "p"}:
-            raise needs_full_azimuths(self.station)
+            raise ConfigError(NEEDS_FULL_AZIMUTHS)
         if self._next is None:
             first = max(times[0], self.begin)
             self._next = float(np.ceil(first / self.config.azimuth.step_s) * self.config.azimuth.step_s)
@@ -413,14 +415,6 @@ class Pipeline:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None:
             self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
-
-
-def needs_full_azimuths(station: Station) -> ConfigError:
-    """What to say where the bernoulli tracker has no full azimuths to follow."""
-    return ConfigError(
-        f"the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; {station.code} does not offer "
-        "them: use --tracker grid"
-    )
 
 
 def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

@@ -21,13 +21,13 @@ import obsnet
 from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps, joined
-from obsnet.errors import LayoutError, WaveformError
+from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table, travel_time
 from obsnet.output import prepare_folder, write_text
-from obsnet.pipeline import Minutes, Pipeline, RunConfig, needs_full_azimuths
+from obsnet.pipeline import NEEDS_FULL_AZIMUTHS, Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
@@ -269,7 +269,7 @@ def _followed(run: Run) -> list[Segment]:
     from obsnet.trackers.bernoulli import track_azimuth
 
     if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
-        raise needs_full_azimuths(run.station)
+        raise ConfigError(NEEDS_FULL_AZIMUTHS)
     times = to_posix(run.maps["time"].values)
     held = track_azimuth(times, run.maps["azimuth_llr"].values, run.maps["azimuth"].values)
     run.live = pd.DataFrame(

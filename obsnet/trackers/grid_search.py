@@ -65,7 +65,7 @@ class GridSearchConfig:
             )
         if not 0.0 <= self.range_scale_std < 1.0:
             raise ConfigError(f"range_scale_std must lie in [0, 1), found {self.range_scale_std}")
-        positive = (
+        for name in (
             "tile_s",
             "tile_bound",
             "exponent",
@@ -73,8 +73,7 @@ class GridSearchConfig:
             "candidates",
             "max_ships",
             "samples",
-        )
-        for name in positive:
+        ):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
 
@@ -108,9 +107,6 @@ APART = 0.1
 
 COARSE_SHARE = 0.6
 """What the bound of a coarse cell is at least of the best score in it; 0.87 at the least for 46 simulated ships."""
-
-GAIN = (1.2, 25.0)
-"""Slope and offset of the most that `MEDIUM` finds around a coarse hypothesis; not exceeded by 866 of 131 simulated records."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -203,25 +199,23 @@ class _Finder:
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
         coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
-        needed = (least + self._runs) / self.config.exponent
-        starts = self._coarse(coarse, needed)
+        starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
         if not starts:
             return None
         fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
-        best, point = COARSE_SHARE * needed, None
-        for start, score in starts:
-            if best < GAIN[0] * score + GAIN[1]:
-                best, point = self._level(start, MEDIUM, fine, best, point)
+        best, point = 0.0, None
+        for start in starts:
+            best, point = self._level(start, MEDIUM, fine, best, point)
         if point is None:
             return None
         best, point = self._level(point, FINE, fine)
         # The evidence is less than the greatest likelihood, by far more than what a finer grid would find.
-        if point is None or best < needed:
+        if point is None or self.config.exponent * best - self._runs < least:
             return None
         return self._track(point, fine)
 
-    def _coarse(self, scores: ScoreMaps, needed: float) -> list[tuple[np.ndarray, float]]:
-        """The best hypotheses of the whole prior from which a score of `needed` may be reached, and their scores, apart, best first."""
+    def _coarse(self, scores: ScoreMaps, needed: float) -> list[np.ndarray]:
+        """The best hypotheses of the whole prior from which a score of `needed` may be reached, apart from each other, best first."""
         config = self.config
         step = config.tile_s
         edge = self.tiles[-1]
@@ -246,10 +240,9 @@ class _Finder:
             said = grid.scores(cells)
             values.flat[cells], headings.flat[cells] = said.max(axis=1), said.argmax(axis=1)
             found = apart(values, config.candidates)
-        places = [
+        return [
             np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]) for t, i, j in found
         ]
-        return [(place, float(values[at])) for place, at in zip(places, found, strict=True)]
 
     def _level(
         self,
@@ -336,18 +329,16 @@ class _Finder:
         """A believable track, its course marginalised over bends; a bent course where the data ask for it."""
         heard = (np.array([track.start, track.end]) - self.origin - straight.mean[0]) * [-1.0, 1.0]
         reach = np.maximum(heard, 0.0) + MARGIN_S
-
-        log_likelihood = self._log_likelihood(scores, silent, reach)
         config = self.config
         # What a turn explains may be another ship's: it must gain as much as a further ship.
         found = bends(
-            straight, log_likelihood, self._inside, reach, least_of_turn=config.min_log_bayes_factor_next,
-            samples=config.samples, seed=config.seed,
+            straight, self._log_likelihood(scores, silent, reach), self._inside, reach,
+            least_of_turn=config.min_log_bayes_factor_next, samples=config.samples, seed=config.seed,
         )  # fmt: skip
         mean = found.mean
         changes: dict[str, Any] = {"covariance": self._of_table(found.covariance, mean)}
         if found.bent:
-            score, per_tile = log_likelihood(mean[None])
+            score, per_tile = score_points(mean[None], self.tiles, self.delay, scores, reach)
             lo, hi = best_run(per_tile[:, 0])
             heard_share = float((per_tile[lo : hi + 1, 0] > 0).mean())
             changes |= {
@@ -355,7 +346,7 @@ class _Finder:
                 "end": float(self.origin + self.tiles[hi]),
                 "motion": self._course(mean, reach),
                 "log_bayes_factor": track.log_bayes_factor + found.log_evidence - straight.log_evidence,
-                "extra": track.extra | {"score": float(score[0]) / config.exponent, "heard": heard_share},
+                "extra": track.extra | {"score": float(score[0]), "heard": heard_share},
             }
         return replace(track, **changes)
 
