@@ -48,6 +48,7 @@ class RangeCalibration:
     ----------
     peaks : highest peaks of the cheap score, of each minute, at which the network looks.
     spread : ranges to either side of a peak at which it looks too. rates : range rates about the best one, at each range.
+    least : of a minute's greatest cheap score; below it, as mostly in noise, the network does not look at all.
     slope, offset : of the network's score. cheap_slope, cheap_offset, cheap_bound : of the cheap one, and its largest value.
     presence_said, presence_seen : increasing knots between which a minute's marginal ratio of presence is put right.
     lowest, highest : of the ratio, what validation supports.
@@ -57,6 +58,7 @@ class RangeCalibration:
     peaks: int = 6
     spread: int = 2
     rates: int = 7
+    least: float = 0.0
     slope: float = 1.0
     offset: float = 0.0
     cheap_slope: float = 0.1
@@ -206,7 +208,7 @@ class LearnedRangeDetector:
         """What the network said, NaN where it did not look, and the cheap score: (minute, rate, range) float32 both."""
         front, cal = self._front, self.calibration
         look = front.look(cepstrogram, minutes)
-        chosen = kernels.choose(look.score, cal.peaks, cal.spread, cal.rates)
+        chosen = kernels.choose(look.score, cal.peaks, cal.spread, cal.rates, cal.least)
         place, rate, column = np.nonzero(chosen)
         said = np.full(look.score.shape, np.nan, np.float32)
         for at in range(0, len(place), BATCH):

@@ -140,8 +140,8 @@ def best_of_others(energy: np.ndarray, score: np.ndarray) -> np.ndarray:
     return best
 
 
-def choose(score: np.ndarray, peaks: int, spread: int, rates: int) -> np.ndarray:
-    """Hypotheses at and around the highest peaks, over range rate, of each window's score.
+def choose(score: np.ndarray, peaks: int, spread: int, rates: int, least: float = 0.0) -> np.ndarray:
+    """Hypotheses at and around the highest peaks, over range rate, of each window's score; none where it nowhere reaches `least`.
 
     Parameters
     ----------
@@ -155,6 +155,7 @@ def choose(score: np.ndarray, peaks: int, spread: int, rates: int) -> np.ndarray
     n_windows, n_rates, n_range = score.shape
     chosen = np.zeros(score.shape, bool)
     best = score.max(axis=1)
+    best[best.max(axis=1) < least] = 0.0
     first = np.clip(score.argmax(axis=1) - rates // 2, 0, max(n_rates - rates, 0))
     around, taken = np.arange(-spread, spread + 1), np.arange(min(rates, n_rates))
     for _ in range(peaks):

@@ -100,7 +100,10 @@ def train_detector(config: DictConfig) -> float:
             found = range_training.finetune(sets, folder, values["weights"], task, trainer, about, say)
             return min(found["loss_before"], found["loss_after"])
         widths = build(RangeNetworkConfig, values["network"], "network")
-        return range_training.train(sets, folder, widths, task, trainer, about, say)["validation_loss"]
+        found = range_training.train(
+            sets, folder, widths, task, trainer, about, say, values.get("begin_with")
+        )
+        return found["validation_loss"]
     raise ConfigError(f"task must be azimuth or range, found {values['task']!r}")
 
 

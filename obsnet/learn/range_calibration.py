@@ -66,17 +66,19 @@ def hear(
     known: np.ndarray,
     features: RangeFeaturesConfig = RangeFeaturesConfig(),
     every: int = 2,
+    look: RangeCalibration = RangeCalibration(),
 ) -> Heard:
     """Run the detector over one minute in `every` of a record, of those of which the truth is known.
 
     Parameters
     ----------
     table : believed propagation table. truth : of `obsnet.learn.range_examples.range_examples`. known : s since 1970.
+    look : says where the network looks.
     """
     times = to_posix(cepstrogram["time"].values)
     half = features.window_s / 2
     minutes = known[(known >= times[0] + half) & (known <= times[-1] - half)][::every]
-    detector = LearnedRangeDetector(table, scorer, RangeCalibration(), features)
+    detector = LearnedRangeDetector(table, scorer, look, features)
     said, cheap = detector.scores(cepstrogram, minutes)
     ships = _by_minute(truth, minutes, features.range_m[-1])
     valid = ~np.isnan(cepstrogram.values[0])

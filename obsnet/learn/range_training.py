@@ -47,6 +47,7 @@ class RangeTaskConfig:
     ----------
     examples : how hypotheses are drawn. features : what is seen of them.
     density_step_m : bins of the density of true ranges, which is the prior of the loss.
+    look : where the network looks, chosen by the likelihood of validation minutes, and the cheap score's bound; calibration fits the rest.
     patch_noise, context_noise : standard deviations of noise added to patches and to the rest of the features in training,
         so that no record is known again by its exact geometry.
     """
@@ -54,6 +55,7 @@ class RangeTaskConfig:
     examples: RangeExamplesConfig = field(default_factory=RangeExamplesConfig)
     features: RangeFeaturesConfig = field(default_factory=RangeFeaturesConfig)
     density_step_m: float = 2500.0
+    look: RangeCalibration = field(default_factory=lambda: RangeCalibration(rates=5, least=10.0))
     patch_noise: float = 0.3
     context_noise: float = 0.12
 
@@ -162,17 +164,32 @@ def train(
     trainer: TrainerConfig = TrainerConfig(),
     about: dict[str, Any] | None = None,
     say: Callable[[str], None] = print,
+    begin_with: str | Path | None = None,
 ) -> dict[str, float]:
     """Train, calibrate and measure on validation records; ``weights.pt`` is written, the metrics come back.
 
     Parameters
     ----------
     sets : prepared sets, used together. folder : of the run. about : anything to keep with the weights.
+    begin_with : weights of an earlier run to begin with, whose network and features are then taken; with no epochs they are
+        calibrated anew and stay as they are.
     """
+    made: Any = seeded(trainer.seed, lambda: RangeNetwork(network, task.features))
+    earlier: dict[str, Any] = {}
+    if begin_with:
+        made, _, features, earlier = restored(begin_with)
+        task = replace(task, features=features)
+    if earlier and not trainer.epochs:
+        share, best = (
+            float(earlier.get("ship_share", SHIP_SHARE)),
+            float(earlier["metrics"]["validation_loss"]),
+        )
+        about = {"trained": {key: earlier.get(key) for key in ("trainer", "examples", "made")}} | (
+            about or {}
+        )
+        return finish(made, sets, folder, task, trainer, {"validation_loss": best}, about, say, share)
     examples = RangeExamples(sets, "train", task)
     check = RangeExamples(sets, "validation", task, examples.prior)
-    made = seeded(trainer.seed, lambda: RangeNetwork(network, task.features))
-    assert isinstance(made, RangeNetwork)
     say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameters(made)} parameters")
     best = fit(RangeProblem(made, examples.ship_share, task), examples, check, folder, trainer)
     return finish(
@@ -245,10 +262,11 @@ def finish(
             truth_of(record),
             known_minutes(record),
             task.features,
+            look=task.look,
         )
         for record in range_records(sets, "validation")
     ]
-    calibration = calibrate(heard, task.features)
+    calibration = calibrate(heard, task.features, task.look)
     found = found | {f"validation_{k}": v for k, v in measure(heard, calibration, task.features).items()}
     description = {
         "task": "range",

@@ -7,6 +7,7 @@ when the sound left it.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -69,32 +70,48 @@ class CourseGrid:
         scores: ScoreMaps,
     ) -> None:
         self.shape = (len(cpa_time), len(cpa_range), len(speed))
-        self._jointly = scores.jointly
+        self._course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
+        self._courses = len(course)
         offset, index = np.unique(np.round(tiles[None, :] - cpa_time[:, None], 3), return_inverse=True)
         self._index = index.reshape(len(cpa_time), len(tiles))
-        course_step = float(course[1] - course[0]) if len(course) > 1 else 360.0
-        rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, course_step, len(course))
-        self._pointing = sliding_window_view(rows.reshape(len(rows), -1), len(course), axis=1)
-        self._place(offset, cpa_range, speed, delay, scores, step, float(course[0]), rows.shape[1:])
+        # Both sides of the station are equally far: a place in the range map serves two cells.
+        far, side = np.unique(np.abs(cpa_range), return_inverse=True)
+        self._far = (side.reshape(-1, 1) * len(speed) + np.arange(len(speed))).reshape(-1)
+        starboard = np.repeat(cpa_range < 0, len(speed))
+        layout, step = self._read(scores)
+        self._place(offset, far, speed, starboard, delay, scores, step, float(course[0]), layout)
+
+    def reading(self, scores: ScoreMaps) -> CourseGrid:
+        """The same courses over other score maps of the same tiles and grids: where they read them is found once."""
+        made = copy.copy(self)
+        made._read(scores)
+        return made
+
+    def _read(self, scores: ScoreMaps) -> tuple[tuple[int, ...], float]:
+        """Take score maps; returns how azimuth rows are laid out (phases, length) and their step, deg."""
+        rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, self._course_step, self._courses)
+        self._pointing = sliding_window_view(rows.reshape(len(rows), -1), self._courses, axis=1)
+        self._range_score, self._best_corner = scores.flat, scores.best_corner
+        self._rates, self._jointly = scores.range_score.shape[2], scores.jointly
+        return rows.shape[1:], step
 
     def _place(
         self,
         offset: np.ndarray,
         cpa_range: np.ndarray,
         speed: np.ndarray,
+        starboard: np.ndarray,
         delay: Delay,
         scores: ScoreMaps,
         azimuth_step: float,
         course_start: float,
-        layout: tuple[int, int],
+        layout: tuple[int, ...],
     ) -> None:
-        """Where each (time heard after CPA, CPA range and speed) reads the score maps."""
+        """Where each (time heard after CPA, CPA range and speed) reads the score maps: the range map by distance, the azimuth map by side too."""
         across, pace = (axis.reshape(-1) for axis in np.meshgrid(cpa_range, speed, indexing="ij"))
         shape = (len(offset), len(across))
-        self._cell, self._row = np.empty(shape, np.int64), np.empty(shape, np.int64)
+        self._cell, self._row = np.empty(shape, np.int64), np.empty((len(offset), len(self._far)), np.int64)
         self._right, self._up = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        self._range_score, self._best_corner = scores.flat, scores.best_corner
-        self._rates = scores.range_score.shape[2]
         bins = int(360.0 / azimuth_step + 0.5)
         phases, length = layout
         step = max(_PLACES_AT_ONCE // len(across), 1)
@@ -104,42 +121,55 @@ class CourseGrid:
             self._cell[part], self._right[part], self._up[part] = scores.corner(
                 distance, pace * path / np.maximum(distance, 1.0)
             )
-            azimuth = np.rad2deg(np.arctan2(across, path)) + course_start
+            azimuth = np.rad2deg(np.arctan2(across, path))[:, self._far]
+            np.negative(azimuth, out=azimuth, where=starboard)
+            azimuth += course_start
             c = np.floor(azimuth / azimuth_step + 0.5).astype(np.int64) % bins
             self._row[part] = (c % phases) * length + c // phases
 
     def bounds(self, threads: int = 1) -> np.ndarray:
         """What no course of a cell exceeds, (n_cpa_time, n_cpa_range, n_speed) float32.
 
-        Every tile counts with the best of its courses and with the best corner of the range map.
+        Every tile counts with the best of its courses, or of all azimuths where courses go all round, and with the best corner
+        of the range map.
         """
-        pointing = np.ascontiguousarray(self._pointing.max(axis=2))
+        pointing = self._pointing.max(axis=2)
+        if abs(self._courses * self._course_step - 360.0) < 1e-6 and self._courses > 1:
+            pointing = pointing.max(axis=1, keepdims=True)
         everywhere = bool((pointing == pointing[:, :1]).all())
         share = self._best_corner
-        out = np.empty((self.shape[0], self._cell.shape[1]), np.float32)
+        # Where the azimuth does not tell cells apart, those of one distance have one bound.
+        columns = self._cell.shape[1] if everywhere else len(self._far)
+        out = np.empty((self.shape[0], columns), np.float32)
 
         def fill(lo: int, hi: int) -> None:
-            run, best = np.zeros((2, hi - lo, out.shape[1]), np.float32)
+            run, best = np.zeros((2, hi - lo, columns), np.float32)
             for m in range(len(share)):
                 offset = self._index[lo:hi, m]
-                ahead = pointing[m, :1] if everywhere else pointing[m].take(self._row[offset])
-                _lengthen(run, best, ahead, share[m].take(self._cell[offset]), self._jointly)
+                heard = share[m].take(self._cell[offset])
+                if everywhere:
+                    _lengthen(run, best, pointing[m, :1], heard, self._jointly)
+                else:
+                    ahead = pointing[m].take(self._row[offset])
+                    _lengthen(run, best, ahead, heard[:, self._far], self._jointly)
             out[lo:hi] = best
 
-        step = min(max(_CELLS_AT_ONCE // out.shape[1], 1), -(-len(out) // threads))
+        step = min(max(_CELLS_AT_ONCE // columns, 1), -(-len(out) // threads))
         with ThreadPoolExecutor(threads) as pool:
             edges = [*range(0, len(out), step), len(out)]
             list(pool.map(fill, edges[:-1], edges[1:]))
-        return out.reshape(self.shape)
+        return (out[:, self._far] if everywhere else out).reshape(self.shape)
 
     def scores(self, cells: np.ndarray) -> np.ndarray:
         """Scores of all courses of chosen cells (flat indices), (n, n_course) float32."""
-        time, where = np.divmod(cells, self._cell.shape[1])
+        time, where = np.divmod(cells, len(self._far))
         run, best = np.zeros((2, len(cells), self._pointing.shape[2]), np.float32)
         for m, score in enumerate(self._range_score):
-            at = self._index[time, m] * self._cell.shape[1] + where
+            offset = self._index[time, m]
+            at = offset * self._cell.shape[1] + self._far[where]
             share = _between(score, self._cell.take(at), self._rates, self._right.take(at), self._up.take(at))
-            _lengthen(run, best, self._pointing[m][self._row.take(at)], share[:, None], self._jointly)
+            row = self._row.take(offset * len(self._far) + where)
+            _lengthen(run, best, self._pointing[m][row], share[:, None], self._jointly)
         return best
 
 

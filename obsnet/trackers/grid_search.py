@@ -186,6 +186,7 @@ class _Finder:
         self.sees_range = "range_llr" in maps
         self._runs = float(np.log(len(times) * (len(times) + 1) / 2))
         self.delay = Delay(np.asarray(delay(np.arange(0.0, 150_001.0, 250.0)), float), 250.0)
+        self._everywhere: CourseGrid | None = None
 
     def find(
         self,
@@ -226,7 +227,9 @@ class _Finder:
             cpa_range = cpa_range[cpa_range >= 0]
         speed = np.arange(config.min_speed_mps, config.max_speed_mps + 1e-9, 0.5)
         course = np.arange(0.0, 360.0, 10.0) if self.sees_course else np.zeros(1)
-        grid = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
+        if self._everywhere is None:
+            self._everywhere = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
+        grid = self._everywhere.reading(scores)
         bounds = grid.bounds(self.threads)
         values, headings = np.full(bounds.shape, -np.inf, np.float32), np.zeros(bounds.shape, int)
         found: list[tuple[int, int, int]] = []

@@ -106,6 +106,14 @@ def test_peaks_are_chosen_with_their_surroundings():
     assert chosen[0:5, 29:32].all()
 
 
+def test_minutes_in_which_nothing_stands_out_are_not_looked_at():
+    score = np.full((3, 13, 50), 1.0, np.float32)
+    score[0, 6, 10], score[1, 6, 10] = 9.0, 10.0
+    chosen = kernels.choose(score, 2, 1, 5, least=10.0)
+    assert chosen.any(axis=(1, 2)).tolist() == [False, True, False]
+    np.testing.assert_array_equal(chosen[1], kernels.choose(score, 2, 1, 5)[1])
+
+
 def test_resampling_is_exact_at_the_grid_and_linear_between():
     coarse = np.random.default_rng(0).standard_normal((2, 4, 6)).astype(np.float32)
     halves = np.arange(11) / 2, np.arange(7) / 2

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,21 @@ def test_training_leaves_weights_that_say_what_they_are(trained):
     assert not network.training
     assert np.isfinite(found["validation_loss"])
     assert about["metrics"] == found
+
+
+def test_trained_weights_are_calibrated_anew_for_another_look_and_stay_as_they_are(
+    trained, prepared, tmp_path
+):
+    look = RangeCalibration(peaks=3, rates=3, least=4.0)
+    none = TrainerConfig(epochs=0, batch=8)
+    found = train(
+        [prepared], tmp_path, task=replace(TASK, look=look), trainer=none, say=lambda text: None, begin_with=trained[0]
+    )  # fmt: skip
+    (before, *_), (after, calibration, _, about) = restored(trained[0]), restored(tmp_path / "weights.pt")
+    assert all(torch.equal(before.state_dict()[name], values) for name, values in after.state_dict().items())
+    assert (calibration.peaks, calibration.rates, calibration.least) == (3, 3, 4.0)
+    assert about["trained"]["trainer"]["epochs"] == 2
+    assert found["validation_loss"] == trained[1]["validation_loss"]
 
 
 def test_the_exported_model_says_the_same_and_detects(trained, prepared, tmp_path):
