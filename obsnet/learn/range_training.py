@@ -28,6 +28,7 @@ from obsnet.learn.range_calibration import calibrate, hear, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
+from obsnet.output import prepare_folder
 from obsnet.signals.cepstrogram import noise_std
 
 WEIGHTS = "weights.pt"
@@ -175,19 +176,17 @@ def train(
         calibrated anew and stay as they are.
     """
     made: Any = seeded(trainer.seed, lambda: RangeNetwork(network, task.features))
-    earlier: dict[str, Any] = {}
     if begin_with:
         made, _, features, earlier = restored(begin_with)
         task = replace(task, features=features)
-    if earlier and not trainer.epochs:
-        share, best = (
-            float(earlier.get("ship_share", SHIP_SHARE)),
-            float(earlier["metrics"]["validation_loss"]),
-        )
-        about = {"trained": {key: earlier.get(key) for key in ("trainer", "examples", "made")}} | (
-            about or {}
-        )
-        return finish(made, sets, folder, task, trainer, {"validation_loss": best}, about, say, share)
+        if not trainer.epochs:
+            about = {
+                "trained": {key: earlier.get(key) for key in ("trainer", "examples", "made")},
+                **(about or {}),
+            }
+            found = {"validation_loss": float(earlier["metrics"]["validation_loss"])}
+            share = float(earlier.get("ship_share", SHIP_SHARE))
+            return finish(made, sets, folder, task, trainer, found, about, say, share)
     examples = RangeExamples(sets, "train", task)
     check = RangeExamples(sets, "validation", task, examples.prior)
     say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameters(made)} parameters")
@@ -281,7 +280,7 @@ def finish(
         "made": provenance(trainer),
         **(about or {}),
     }
-    save_weights(Path(folder) / WEIGHTS, network, description)
+    save_weights(prepare_folder(folder) / WEIGHTS, network, description)
     for name, value in found.items():
         say(f"{name} {value:.4g}")
     return found

@@ -93,9 +93,12 @@ def test_trained_weights_are_calibrated_anew_for_another_look_and_stay_as_they_a
     look = RangeCalibration(peaks=3, rates=3, least=4.0)
     none = TrainerConfig(epochs=0, batch=8)
     found = train(
-        [prepared], tmp_path, task=replace(TASK, look=look), trainer=none, say=lambda text: None, begin_with=trained[0]
+        [prepared], tmp_path / "new", task=replace(TASK, look=look), trainer=none, say=lambda text: None, begin_with=trained[0]
     )  # fmt: skip
-    (before, *_), (after, calibration, _, about) = restored(trained[0]), restored(tmp_path / "weights.pt")
+    (before, *_), (after, calibration, _, about) = (
+        restored(trained[0]),
+        restored(tmp_path / "new" / "weights.pt"),
+    )
     assert all(torch.equal(before.state_dict()[name], values) for name, values in after.state_dict().items())
     assert (calibration.peaks, calibration.rates, calibration.least) == (3, 3, 4.0)
     assert about["trained"]["trainer"]["epochs"] == 2
