@@ -73,12 +73,12 @@ def hear(
     Parameters
     ----------
     table : believed propagation table. truth : of `obsnet.learn.range_examples.range_examples`. known : s since 1970.
-    look : says where the network looks.
+    look : says where the network looks; it does in every minute, whatever the `least` (see `looked_at`).
     """
     times = to_posix(cepstrogram["time"].values)
     half = features.window_s / 2
     minutes = known[(known >= times[0] + half) & (known <= times[-1] - half)][::every]
-    detector = LearnedRangeDetector(table, scorer, look, features)
+    detector = LearnedRangeDetector(table, scorer, replace(look, least=0.0), features)
     said, cheap = detector.scores(cepstrogram, minutes)
     ships = _by_minute(truth, minutes, features.range_m[-1])
     valid = ~np.isnan(cepstrogram.values[0])
@@ -87,12 +87,24 @@ def hear(
     return Heard(minutes[there], said[there], cheap[there], [ships[k] for k in there])
 
 
+def looked_at(heard: Sequence[Heard], least: float) -> list[Heard]:
+    """Records as if the network had looked only at minutes whose greatest cheap score reaches `least`."""
+    found = []
+    for record in heard:
+        looks = record.cheap.max(axis=(1, 2), keepdims=True) >= least
+        found.append(replace(record, network=np.where(looks, record.network, np.float32(np.nan))))
+    return found
+
+
 def calibrate(
     heard: Sequence[Heard],
     features: RangeFeaturesConfig = RangeFeaturesConfig(),
     start: RangeCalibration = RangeCalibration(),
 ) -> RangeCalibration:
-    """Slopes and offsets by maximum likelihood, bounds by the number of independent windows, exponent by wrong tracks."""
+    """Slopes and offsets by maximum likelihood, bounds by the number of independent windows, exponent by wrong tracks.
+
+    Slopes and offsets are those of looks at every minute; the rest is of the detector as it looks, from `start.least` on.
+    """
     parts = _parts(heard, features)
     odds = _odds(parts.ship)
     free = torch.tensor([0.0, 0.0, float(np.log(start.cheap_slope)), start.cheap_offset], requires_grad=True)
@@ -110,6 +122,7 @@ def calibrate(
         start, slope=float(np.exp(slope)), offset=offset, cheap_slope=float(np.exp(cheap_slope)), cheap_offset=cheap_offset,
         lowest=-100.0, highest=100.0,
     )  # fmt: skip
+    heard = looked_at(heard, start.least)
     said, seen = _presence(heard, features, fitted)
     spans = sum(np.ptp(record.minutes) for record in heard if len(record.minutes))
     evidence = float(np.log(max(spans / 60.0 / INDEPENDENT_MIN, 10.0)))

@@ -24,7 +24,7 @@ from obsnet.layout import from_posix
 from obsnet.learn.dataset import PreparedSet, Record
 from obsnet.learn.networks import parameters
 from obsnet.learn.prepare import provenance
-from obsnet.learn.range_calibration import calibrate, hear, measure, scorer_of
+from obsnet.learn.range_calibration import calibrate, hear, looked_at, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
@@ -56,7 +56,7 @@ class RangeTaskConfig:
     examples: RangeExamplesConfig = field(default_factory=RangeExamplesConfig)
     features: RangeFeaturesConfig = field(default_factory=RangeFeaturesConfig)
     density_step_m: float = 2500.0
-    look: RangeCalibration = field(default_factory=lambda: RangeCalibration(rates=5, least=10.0))
+    look: RangeCalibration = field(default_factory=lambda: RangeCalibration(rates=5, least=8.0))
     patch_noise: float = 0.3
     context_noise: float = 0.12
 
@@ -266,6 +266,7 @@ def finish(
         for record in range_records(sets, "validation")
     ]
     calibration = calibrate(heard, task.features, task.look)
+    heard = looked_at(heard, calibration.least)
     found = found | {f"validation_{k}": v for k, v in measure(heard, calibration, task.features).items()}
     description = {
         "task": "range",

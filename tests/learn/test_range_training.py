@@ -12,7 +12,7 @@ from obsnet.detectors.range_features import RangeFeaturesConfig  # noqa: E402
 from obsnet.errors import ConfigError, ModelError  # noqa: E402
 from obsnet.layout import from_posix  # noqa: E402
 from obsnet.learn.dataset import PreparedSet, Record, packed_table  # noqa: E402
-from obsnet.learn.range_calibration import Heard, calibrate, measure  # noqa: E402
+from obsnet.learn.range_calibration import Heard, calibrate, looked_at, measure  # noqa: E402
 from obsnet.learn.range_examples import RangeExamplesConfig  # noqa: E402
 from obsnet.learn.range_export import export_range, range_parity  # noqa: E402
 from obsnet.learn.range_network import RangeNetworkConfig  # noqa: E402
@@ -208,6 +208,19 @@ def test_calibration_makes_overconfidence_honest():
     assert before["ece"] > 0.2
     assert after["ece"] < 0.05
     assert after["nll"] < before["nll"]
+
+
+def test_what_is_not_looked_at_changes_presence_and_not_the_slopes():
+    records = [heard(k, k % 2 == 0, 4.0) for k in range(6)]
+    for record in records:
+        record.cheap[::3] *= 0.2
+        record.cheap[:, 5, 100] = np.maximum(record.cheap[:, 5, 100], 9.0 * (np.arange(60) % 3 > 0))
+    every, some = (calibrate(records, start=RangeCalibration(least=least)) for least in (0.0, 8.0))
+    assert (some.slope, some.offset, some.cheap_slope) == (every.slope, every.offset, every.cheap_slope)
+    assert some.presence_said != every.presence_said
+    seen = looked_at(records, 8.0)[0]
+    assert np.isnan(seen.network[::3]).all()
+    np.testing.assert_array_equal(seen.network[1::3], records[0].network[1::3])
 
 
 def test_calibrated_detections_are_counted_right():
