@@ -44,15 +44,18 @@ class TimeWriter:
         try:
             if self._file is None:
                 self._file = self._create(block)
-            time = self._file.dimensions["time"].size
-            stop = time + block.sizes["time"]
-            self._file.resize_dimension("time", stop)
-            self._file.variables["time"][time:stop] = to_posix(block["time"].values)
+            self._extend("time", to_posix(block["time"].values))
             for name, values in _real(block).items():
-                self._file.variables[name][time:stop] = pack(name, values.transpose("time", ...).values)
+                self._extend(name, pack(name, values.transpose("time", ...).values))
         except OSError as error:
             raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from None
         self._require_written()
+
+    def _extend(self, name: str, rows: np.ndarray) -> None:
+        variable = self._file[name]
+        first = len(variable)
+        variable.resize(first + len(rows), axis=0)
+        variable[first:] = rows
 
     def close(self) -> None:
         """Finish the file and move it to its name."""
@@ -95,8 +98,15 @@ class TimeWriter:
         self._partial.parent.mkdir(parents=True, exist_ok=True)
         self._bytes = _PatientFile(self._partial, "w+")
         import h5netcdf
+        import h5py
 
-        file = h5netcdf.File(self._bytes, "w")
+        with h5netcdf.File(self._bytes, "w") as file:
+            self._lay_out(file, block)
+        # Every growth through h5netcdf asks each variable of each dimension for its length: 5 ms a variable.
+        return h5py.File(self._bytes, "r+")
+
+    def _lay_out(self, file: Any, block: xr.Dataset) -> None:
+        """Dimensions, coordinates and empty variables."""
         file.attrs["Conventions"] = "CF-1.11"
         for key, value in self._attrs.items():
             file.attrs[key] = value
@@ -127,7 +137,6 @@ class TimeWriter:
             variable.attrs.update(values.attrs)
             if packed:
                 variable.attrs.update({"scale_factor": np.float32(PACKED[name])})
-        return file
 
 
 class _PatientFile(io.FileIO):
