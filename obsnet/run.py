@@ -17,10 +17,9 @@ import pandas as pd
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-import obsnet
 from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
-from obsnet.detectors.maps import LikelihoodMaps, joined
+from obsnet.detectors.maps import LikelihoodMaps
 from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
@@ -32,6 +31,7 @@ from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
+from obsnet.sinks import FolderSink, MemorySink
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.segmentation import segments
@@ -176,18 +176,33 @@ def _run(
 ) -> Run:
     clock = Clock()
     threads = threads or os.cpu_count() or 1
-    source = open_waveforms(
-        waveforms, station, starttime=starttime, endtime=endtime, min_rate_hz=config.spectra.analysis_rate_hz
-    )
-    clock.lap("open")
-    sink = _FolderSink(folder, station) if folder is not None else _MemorySink()
-    with Pipeline(station, config, amplitudes, table, threads) as pipeline, sink:
-        clock.lap("model")
-        for minutes in _stream(source, config, pipeline, progress, clock):
-            sink.append(minutes)
-            clock.lap("write")
-        _require_minutes(sink.detections(), source, config)
-        maps, features = sink.close()
+
+    def listen(
+        station: Station,
+    ) -> tuple[WaveformSource, Pipeline, MemorySink, xr.Dataset, xr.Dataset | Path]:
+        source = open_waveforms(
+            waveforms,
+            station,
+            starttime=starttime,
+            endtime=endtime,
+            min_rate_hz=config.spectra.analysis_rate_hz,
+        )
+        clock.lap("open")
+        sink = FolderSink(folder, station) if folder is not None else MemorySink()
+        with Pipeline(station, config, amplitudes, table, threads) as pipeline, sink:
+            clock.lap("model")
+            for minutes in _stream(source, config, pipeline, progress, clock):
+                sink.append(minutes)
+                clock.lap("write")
+            _require_minutes(sink.detections(), source, config)
+            return source, pipeline, sink, *sink.close()
+
+    try:
+        source, pipeline, sink, maps, features = listen(station)
+    except _MuteHydrophone as mute:
+        station = station.without(mute.seed_id)
+        source, pipeline, sink, maps, features = listen(station)
+        source.report.left_aside[mute.seed_id] = "never works: gone on as if there were no hydrophone"
     run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
     if heard is not None:
         heard(run)
@@ -201,10 +216,25 @@ def _run(
     return run
 
 
+class _MuteHydrophone(Exception):
+    """The hydrophone never worked, and nothing else keeps the horizontals from being heard."""
+
+    def __init__(self, seed_id: str) -> None:
+        self.seed_id = seed_id
+
+
 def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: RunConfig) -> None:
-    """Raise `WaveformError` where no minute has data: a record in which nothing was heard is no sea without ships."""
+    """Raise `WaveformError` where no minute has data: a record in which nothing was heard is no sea without ships.
+
+    `_MuteHydrophone` where it is for the hydrophone alone.
+    """
     if (detections["coverage"] > 0).any():
         return
+    pressure, horizontals = source.station.pressure, source.station.horizontals
+    frames = {seed_id: channel.usable_frames for seed_id, channel in source.report.channels.items()}
+    others_work = len(horizontals) > 1 and all(frames.get(channel.seed_id) for channel in horizontals)
+    if pressure is not None and not frames.get(pressure.seed_id) and others_work:
+        raise _MuteHydrophone(pressure.seed_id)
     begin, end = (iso(ns / 1e9) for ns in (source.begin_ns, source.end_ns))
     why = [
         f"{seed_id}: {channel.gap_s:g} s of gaps, {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
@@ -314,61 +344,6 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         delay=delay,
     )
     return [found] if found is not None and found.end - found.start >= BEARINGS_SHORTEST_S else []
-
-
-class _MemorySink:
-    """Collects minutes in memory."""
-
-    def __init__(self) -> None:
-        self._minutes: list[Minutes] = []
-
-    def append(self, minutes: Minutes) -> None:
-        self._minutes.append(minutes)
-
-    def close(self) -> tuple[xr.Dataset, xr.Dataset | Path]:
-        return joined([m.maps for m in self._minutes]), joined([m.features for m in self._minutes])
-
-    def detections(self) -> pd.DataFrame:
-        frames = [m.detections for m in self._minutes]
-        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=DETECTION_COLUMNS)
-
-    def presence(self) -> pd.DataFrame:
-        return pd.concat([m.presence for m in self._minutes]) if self._minutes else pd.DataFrame()
-
-    def __enter__(self) -> _MemorySink:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        return None
-
-
-class _FolderSink(_MemorySink):
-    """Writes maps and features to disk as they come; keeps the small tables."""
-
-    def __init__(self, folder: str | Path, station: Station) -> None:
-        super().__init__()
-        self._folder = prepare_folder(folder)
-        attrs = {"station": station.code, "source": f"obsnet {obsnet.__version__}"}
-        self._writers = [
-            netcdf.TimeWriter(self._folder / f"{name}.nc", attrs) for name in ("maps", "features")
-        ]
-
-    def append(self, minutes: Minutes) -> None:
-        self._writers[0].append(minutes.maps)
-        self._writers[1].append(minutes.features)
-        empty = xr.Dataset()
-        self._minutes.append(Minutes(empty, minutes.detections, minutes.presence, empty))
-
-    def close(self) -> tuple[xr.Dataset, xr.Dataset | Path]:
-        if not self._minutes:
-            return _MemorySink().close()
-        for writer in self._writers:
-            writer.close()
-        return netcdf.read(self._folder / "maps.nc"), self._folder / "features.nc"
-
-    def __exit__(self, *error: Any) -> None:
-        for writer in self._writers:
-            writer.__exit__(*error)
 
 
 def write_tables(run: Run, folder: Path) -> None:

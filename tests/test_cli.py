@@ -97,13 +97,16 @@ def test_a_record_in_which_nothing_works(refused, stream, tmp_path):
     assert "BH1: 0 s of gaps, 70" in line
 
 
-def test_a_hydrophone_that_never_works_may_be_left_out(
-    refused, obsnet, stream, inventory, tmp_path, unplotted
-):
+def test_a_hydrophone_that_never_works_is_left_out(obsnet, record, stream, inventory, tmp_path, unplotted):
     for trace in (dead := stream.copy()).select(channel="BDH"):
         trace.data[:] = 0
     dead.write(str(tmp_path / "dead.mseed"), "MSEED")
-    assert "leave out of the StationXML what never works" in refused(waveforms=tmp_path / "dead.mseed")
+    said = obsnet(
+        "detect", tmp_path / "dead.mseed", "--station", record / "station.xml", "--out", tmp_path / "found"
+    )
+    assert said[0] == 0
+    assert any("ambiguous by 180°" in line for line in said[1])
+    assert any("BDH never works: gone on as if there were no hydrophone" in line for line in said[1])
     keep("BH1", "BH2", "BHZ")((without := copy.deepcopy(inventory))[0])
     without.write(str(tmp_path / "s.xml"), "STATIONXML")
     given = (
@@ -115,6 +118,9 @@ def test_a_hydrophone_that_never_works_may_be_left_out(
         tmp_path / "azimuths",
     )
     assert obsnet(*given, "--quiet") == (0, [], [])
+    assert (tmp_path / "found" / "detections.csv").read_text() == (
+        tmp_path / "azimuths" / "detections.csv"
+    ).read_text()
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,7 @@ class ChannelSpectra:
             self._turn(out[chosen], late[chosen])
         out[dead | stuck] = complex(np.nan, np.nan)
         report = self._source.report.channels[channel.seed_id]
+        report.usable_frames += int((~(dead | stuck)).sum())
         report.dead_frames += int(dead.sum())
         report.clipped_frames += int((stuck & ~dead).sum())
         report.transform = transform.name

@@ -215,6 +215,14 @@ class Station:
         """Azimuth of the first horizontal, or None where there is none or it is unknown."""
         return self.horizontals[0].azimuth_deg if self.horizontals else None
 
+    def without(self, seed_id: str) -> Station:
+        """The station as if it had not one of its channels."""
+        channels, epochs = (
+            tuple(channel for channel in held if channel.seed_id != seed_id)
+            for held in (self.channels, self.epochs)
+        )
+        return replace(self, channels=channels, epochs=epochs)
+
     def at(self, time: float | None = None, seed_ids: Collection[str] | None = None) -> Station:
         """The station with the channels that serve at a time.
 

@@ -32,7 +32,7 @@ _CHECKED_S = 60.0
 
 @dataclass
 class ChannelReport:
-    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last three."""
+    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last four."""
 
     sampling_rate: float
     starttime: str
@@ -41,6 +41,7 @@ class ChannelReport:
     gap_s: float = 0.0
     overlaps: int = 0
     conflicting_overlaps: int = 0
+    usable_frames: int = 0
     dead_frames: int = 0
     clipped_frames: int = 0
     transform: str = ""

@@ -183,6 +183,7 @@ class _Finder:
         self.range_m = maps["range"].values if "range_llr" in maps else np.array([0.0, 1.0, 2.0])
         self.rate = maps["range_rate"].values if "range_llr" in maps else np.array([-1.0, 0.0, 1.0])
         self.sees_course = "azimuth_llr" in maps
+        self.ambiguity_deg = int(maps["azimuth"].attrs.get("ambiguity_deg", 360)) if self.sees_course else 360
         self.sees_range = "range_llr" in maps
         self._runs = float(np.log(len(times) * (len(times) + 1) / 2))
         self.delay = Delay(np.asarray(delay(np.arange(0.0, 150_001.0, 250.0)), float), 250.0)
@@ -467,9 +468,11 @@ class _Finder:
             range_llr = np.where(here, np.minimum(range_llr, 0.0), range_llr)
         if azimuth_llr is not None:
             # A ship that keeps its range but not its azimuth has turned: what is heard nearby is still that ship.
-            explained = lobe(azimuth_llr, self.azimuth, azimuth, TURN_DEG)
-            beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None])) <= TURN_DEG
-            explained |= beside & ranged[:, None]
+            explained = np.zeros(azimuth_llr.shape, bool)
+            for turn in range(0, 360, self.ambiguity_deg):
+                beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None] - turn)) <= TURN_DEG
+                explained |= beside & ranged[:, None]
+                explained |= lobe(azimuth_llr, self.azimuth, azimuth + turn, TURN_DEG)
             explained &= np.isfinite(distance)[:, None]
             # Where one ship is loud, a ship anywhere may explain more than none: the next is held against the first.
             azimuth_llr = above_floor(

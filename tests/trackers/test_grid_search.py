@@ -244,6 +244,18 @@ def test_range_alone_finds_the_passage_but_no_course():
     assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
 
 
+def test_azimuths_known_up_to_180_degrees_give_a_ship_once():
+    truth = StraightCourse(T0 + 7000.0, 9_000.0, 60.0, 8.0)
+    maps = maps_of([truth], MINUTES, np.random.default_rng(5)).drop_vars(["range_llr", "range_coverage"])
+    opposite = np.roll(maps["azimuth_llr"].values, 180, axis=1)
+    maps["azimuth_llr"] = ("time", "azimuth"), np.maximum(maps["azimuth_llr"].values, opposite)
+    maps["azimuth"].attrs["ambiguity_deg"] = 180
+    (found,) = search(maps, SEGMENT, delay)
+    assert abs(found.motion.cpa_time - truth.cpa_time) < 120.0
+    assert abs(wrap180(2.0 * (found.motion.course_deg - 60.0))) < 20.0
+    assert found.motion.cpa_range_m > 0
+
+
 def test_azimuths_without_data_are_no_azimuths():
     """A horizontal that is dead throughout leaves maps of NaN: no course comes of them."""
     truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
