@@ -281,9 +281,7 @@ class _Finder:
         """The posterior around the best hypothesis, as a track."""
         config = self.config
         seen = np.array([True, True, self.sees_course, True])
-        silent = (
-            self.sees_course and self.sees_range and ranged(best, self.tiles, self.delay, scores) < SILENT
-        )
+        silent = self.sees_course and ranged(best, self.tiles, self.delay, scores) < SILENT
         if silent:
             scores = scores.without_range()
 
@@ -300,9 +298,10 @@ class _Finder:
         if not self.sees_course:
             cov[2, :] = cov[:, 2] = 0.0
             cov[2, 2] = np.inf
-        method = "grid search" if self.sees_course and self.sees_range else _blind(self.sees_course)
+        method = "grid search" if self.sees_course else "grid search, no azimuth maps: course not observed"
         if silent:
-            method = f"grid search, no range heard: speed taken as {USUAL_MPS[0]:g} ± {USUAL_MPS[1]:g} m/s"
+            why = "no range heard" if self.sees_range else "no range maps"
+            method = f"grid search, {why}: speed taken as {USUAL_MPS[0]:g} ± {USUAL_MPS[1]:g} m/s"
         extra = {
             "score": float(score[0]),
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
@@ -485,9 +484,3 @@ def _is_no_remainder(track: Track) -> bool:
     """Whether a further ship is heard, and located, as what is left of a known one is not."""
     located = track.std[0] < LOOSEST_NEXT[0] and track.std[1] < LOOSEST_NEXT[1]
     return bool(located and track.extra["heard"] >= 0.5)
-
-
-def _blind(sees_course: bool) -> str:
-    return (
-        "grid search, no range maps" if sees_course else "grid search, no azimuth maps: course not observed"
-    )

@@ -254,6 +254,8 @@ def test_azimuths_known_up_to_180_degrees_give_a_ship_once():
     assert abs(found.motion.cpa_time - truth.cpa_time) < 120.0
     assert abs(wrap180(2.0 * (found.motion.course_deg - 60.0))) < 20.0
     assert found.motion.cpa_range_m > 0
+    assert "no range maps: speed taken as 7.5" in found.method
+    assert abs(found.motion.speed_mps - 7.5) < 2.0 and 1.0 < found.std[3] < 3.0
 
 
 def test_azimuths_without_data_are_no_azimuths():
