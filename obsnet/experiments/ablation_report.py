@@ -20,8 +20,8 @@ from obsnet.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YEL
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-WRONG_PER_HOUR = 1.0
-"""What a detector may get wrong over all validation records: its threshold is the lowest that keeps to it."""
+WRONG_PER_HOUR, FALSE_PER_HOUR = 1.0, 0.5
+"""What a detector may get wrong over all validation records, and in any of them without a ship: its threshold is the lowest that keeps to both."""
 REACH_BIN_M = 5000.0
 COLOURS = (BLUE, SKY, GREEN, YELLOW, ORANGE, VERMILLION, PURPLE)
 
@@ -65,19 +65,28 @@ def main(makers: Mapping[str, Maker], description: str | None = None) -> None:
     print(text(write(plan, given.folder, given.out)))
 
 
-def thresholds(validation: list[Outcome], wrong_per_hour: float = WRONG_PER_HOUR) -> dict[str, float]:
-    """Lowest log presence ratio of each sensor with at most so many wrong or false minutes an hour, pooled over records."""
+def thresholds(
+    validation: list[Outcome], wrong_per_hour: float = WRONG_PER_HOUR, false_per_hour: float = FALSE_PER_HOUR
+) -> dict[str, float]:
+    """Lowest log presence ratio of each sensor with at most so many wrong or false minutes an hour, pooled over records, and in
+    each record without a ship at most `false_per_hour`."""
     chosen = {}
     for sensor in ("azimuth", "range"):
         pooled = [minutes for _, _, minutes, _ in validation if f"{sensor}_llr" in minutes]
         if not pooled:
             continue
-        table = pd.concat(pooled)
-        hours = float(table["covered"].sum()) / 60.0
-        wrong = np.sort(table.loc[table[f"{sensor}_right"] == 0, f"{sensor}_llr"].dropna().to_numpy())[::-1]
-        allowed = int(wrong_per_hour * hours)
-        chosen[sensor] = float(wrong[allowed]) if allowed < len(wrong) else -np.inf
+        empty = [minutes for minutes in pooled if minutes["range_true_m"].isna().all()]
+        limits = [_threshold(minutes, sensor, false_per_hour) for minutes in empty]
+        chosen[sensor] = max([_threshold(pd.concat(pooled), sensor, wrong_per_hour), *limits])
     return chosen
+
+
+def _threshold(minutes: pd.DataFrame, sensor: str, wrong_per_hour: float) -> float:
+    """Lowest log presence ratio of a sensor with at most so many wrong or false minutes an hour."""
+    hours = float(minutes["covered"].sum()) / 60.0
+    wrong = np.sort(minutes.loc[minutes[f"{sensor}_right"] == 0, f"{sensor}_llr"].dropna().to_numpy())[::-1]
+    allowed = int(wrong_per_hour * hours)
+    return float(wrong[allowed]) if allowed < len(wrong) else -np.inf
 
 
 def table(plan: Plan, folder: str | Path) -> pd.DataFrame:

@@ -74,9 +74,25 @@ def test_without_ships_every_estimate_is_false():
 
 
 def test_the_threshold_lets_pass_as_many_wrong_minutes_as_allowed():
-    minutes = pd.DataFrame({"covered": 1, "azimuth_right": 0, "azimuth_llr": np.arange(600.0)})
+    minutes = pd.DataFrame(
+        {"covered": 1, "range_true_m": 1e4, "azimuth_right": 0, "azimuth_llr": np.arange(600.0)}
+    )
     chosen = ablation_report.thresholds([("twin", "ordinary", minutes, {})], wrong_per_hour=2.0)
     assert (minutes["azimuth_llr"] > chosen["azimuth"]).sum() == 20
+
+
+def test_the_threshold_keeps_every_record_without_a_ship_quiet():
+    minutes = pd.DataFrame(
+        {"covered": 1, "range_true_m": 1e4, "azimuth_right": 1, "azimuth_llr": np.arange(600.0)}
+    )
+    quiet, loud = (
+        minutes.assign(range_true_m=np.nan, azimuth_right=0, azimuth_llr=np.arange(600.0) + shift) for shift in (-700, 50)
+    )  # fmt: skip
+    records = [
+        ("twin", kind, part, {}) for kind, part in (("faint", minutes), ("no_ship", quiet), ("no_ship", loud))
+    ]
+    chosen = ablation_report.thresholds(records, wrong_per_hour=100.0, false_per_hour=0.5)
+    assert (loud["azimuth_llr"] > chosen["azimuth"]).sum() == 5
 
 
 def test_recalibration_recovers_the_slope_of_overconfident_ratios(tmp_path):
