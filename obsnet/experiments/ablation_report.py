@@ -69,7 +69,8 @@ def thresholds(
     validation: list[Outcome], wrong_per_hour: float = WRONG_PER_HOUR, false_per_hour: float = FALSE_PER_HOUR
 ) -> dict[str, float]:
     """Lowest log presence ratio of each sensor with at most so many wrong or false minutes an hour, pooled over records, and in
-    each record without a ship at most `false_per_hour`."""
+    each record without a ship at most `false_per_hour`.
+    """
     chosen = {}
     for sensor in ("azimuth", "range"):
         pooled = [minutes for _, _, minutes, _ in validation if f"{sensor}_llr" in minutes]
