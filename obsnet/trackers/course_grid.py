@@ -20,6 +20,10 @@ from obsnet.trackers.score_maps import ScoreMaps, polyphase
 _CELLS_AT_ONCE, _PLACES_AT_ONCE = 1 << 16, 1 << 14
 _FIRST_BATCH, _LARGEST_BATCH = 512, 8192
 _TILES_AT_ONCE = 8
+_SCALES, _SCALE_STEP, _APART = 55, 0.02, 0.12
+"""Scales looked at to either side, and their step and the least that counts as another, in natural logarithms."""
+NEARLY = 0.75
+"""Share of what range maps say for a track from which on a ghost of it counts as nearly as likely."""
 
 
 @dataclass(frozen=True)
@@ -252,6 +256,42 @@ def ranged(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
     _, pointing = score_points(point[None], tiles, delay, scores.without_range())
     first, last = best_run(both[:, 0])
     return float(np.maximum(both - pointing, 0.0)[first : last + 1].sum())
+
+
+def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:
+    """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
+    held = np.arange(lo, hi + 1)
+    hours = (tiles[held] - tiles[held].mean()) / 3600.0
+    bins = scores.azimuth_score.shape[1]
+    azimuth = np.arange(bins)
+    best = -np.inf
+    for drift in np.linspace(-still_deg_per_hour, still_deg_per_hour, 9):
+        shift = np.round(drift * hours / scores.azimuth_step).astype(int)
+        best = max(best, scores.azimuth_score[held, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
+    return float(best)
+
+
+def other_scale(
+    point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps, slowest: float, fastest: float
+) -> float | None:
+    """By what to multiply a course's CPA range and speed to reach the ghost for which range maps say nearly as much, if any does.
+
+    Bearings leave that scale open, and path pairs read as their neighbours repeat a course at another.
+
+    Parameters
+    ----------
+    slowest, fastest : that a ship may be, m/s.
+    """
+    scales = np.exp(np.arange(-_SCALES, _SCALES + 1) * _SCALE_STEP)
+    points = np.repeat(point[None], len(scales), axis=0)
+    points[:, [1, 3]] *= scales[:, None]
+    both, _ = score_points(points, tiles, delay, scores)
+    pointing, _ = score_points(points, tiles, delay, scores.without_range())
+    said = both - pointing
+    ridge = np.concatenate([[False], (said[1:-1] >= said[:-2]) & (said[1:-1] > said[2:]), [False]])
+    ridge &= (np.abs(np.log(scales)) > _APART) & (points[:, 3] > slowest) & (points[:, 3] < fastest)
+    found = np.flatnonzero(ridge & (said >= NEARLY * max(said[_SCALES], 0.0)))
+    return float(scales[found[said[found].argmax()]]) if found.size else None
 
 
 def _heard(

@@ -18,7 +18,17 @@ import xarray as xr
 from obsnet.errors import ConfigError
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
-from obsnet.trackers.course_grid import CourseGrid, Delay, apart, best_first, best_run, ranged, score_points
+from obsnet.trackers.course_grid import (
+    CourseGrid,
+    Delay,
+    apart,
+    best_first,
+    best_run,
+    fixed_source,
+    other_scale,
+    ranged,
+    score_points,
+)
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import ScoreMaps, above_floor, azimuth_scores, lobe, range_scores, tiles
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
@@ -290,18 +300,29 @@ class _Finder:
         mean, cov = known.mean, known.covariance
         score, per_tile = score_points(best[None], self.tiles, self.delay, scores)
         lo, hi = best_run(per_tile[:, 0])
-        fixed = self._fixed_source(scores, lo, hi)
-        span = self.tiles[-1] + 3600.0
-        volume = span * 2 * config.max_cpa_range_m * (config.max_speed_mps - config.min_speed_mps)
-        volume *= 360.0 if self.sees_course else 0.5
+        volume = (
+            (self.tiles[-1] + 3600.0) * config.max_cpa_range_m * (config.max_speed_mps - config.min_speed_mps)
+        )
+        volume *= 720.0 if self.sees_course else 1.0
         log_bayes_factor = float(known.log_evidence - np.log(volume) - self._runs)
         if not self.sees_course:
             cov[2, :] = cov[:, 2] = 0.0
             cov[2, 2] = np.inf
+        fixed = (
+            fixed_source(self.tiles, scores, lo, hi, config.still_deg_per_hour) if self.sees_course else 0.0
+        )
         method = "grid search" if self.sees_course else "grid search, no azimuth maps: course not observed"
         if silent:
             why = "no range heard" if self.sees_range else "no range maps"
             method = f"grid search, {why}: speed taken as {USUAL_MPS[0]:g} ± {USUAL_MPS[1]:g} m/s"
+        elif self.sees_course:
+            ghost = other_scale(
+                best, self.tiles, self.delay, scores, config.min_speed_mps, config.max_speed_mps
+            )
+            if ghost is not None:
+                method += (
+                    f"; nearly as likely {ghost * abs(mean[1]) / 1e3:.1f} km at {ghost * mean[3]:.1f} m/s"
+                )
         extra = {
             "score": float(score[0]),
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
@@ -367,20 +388,6 @@ class _Finder:
         """The covariance with the propagation table's own error: it scales CPA range and speed alike."""
         scaled = self.config.range_scale_std * np.array([0.0, mean[1], 0.0, mean[3]])
         return covariance + (np.outer(scaled, scaled) if self.sees_range else 0.0)
-
-    def _fixed_source(self, scores: ScoreMaps, lo: int, hi: int) -> float:
-        """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
-        if not self.sees_course:
-            return 0.0
-        tiles = np.arange(lo, hi + 1)
-        hours = (self.tiles[tiles] - self.tiles[tiles].mean()) / 3600.0
-        bins = scores.azimuth_score.shape[1]
-        azimuth = np.arange(bins)
-        best = -np.inf
-        for drift in np.linspace(-self.config.still_deg_per_hour, self.config.still_deg_per_hour, 9):
-            shift = np.round(drift * hours / scores.azimuth_step).astype(int)
-            best = max(best, scores.azimuth_score[tiles, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
-        return float(best)
 
     def believable(self, track: Track) -> bool:
         """Whether a track moves as a ship does, is known well enough to be one, and lies within the prior, not against its edge."""

@@ -1,5 +1,6 @@
 """Grid search: known courses come back, on the right side, where the ship was; nothing comes from nothing."""
 
+import re
 from unittest.mock import ANY
 
 import numpy as np
@@ -242,6 +243,24 @@ def test_range_alone_finds_the_passage_but_no_course():
     assert abs(found.motion.cpa_time - truth.cpa_time) < 60.0
     assert abs(found.motion.cpa_range_m) == pytest.approx(10_000.0, abs=400.0)
     assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
+
+
+@pytest.mark.parametrize(("strength", "open"), [(1.2, True), (0.5, False)])
+def test_a_ghost_as_loud_as_the_ship_is_said(strength, open):
+    """A course at twice the distance and speed has the same bearings."""
+    truth, twice = (StraightCourse(T0 + 7000.0, s * 6_000.0, 60.0, s * 5.0) for s in (1.0, 2.0))
+    maps, ghost = (
+        maps_of([course], MINUTES, np.random.default_rng(6), ghosts=False, miss=0.0) for course in (truth, twice)
+    )  # fmt: skip
+    maps["range_llr"] = np.maximum(maps["range_llr"], strength * ghost["range_llr"])
+    (found,) = search(maps, SEGMENT, delay)
+    assert found.motion.cpa_range_m == pytest.approx(6_000.0, abs=400.0)
+    said = re.search(r"nearly as likely (.*) km at (.*) m/s", found.method)
+    assert (said is not None) is open
+    if said is not None:
+        assert float(said[1]) == pytest.approx(12.0, abs=0.5) and float(said[2]) == pytest.approx(
+            10.0, abs=0.3
+        )
 
 
 def test_azimuths_known_up_to_180_degrees_give_a_ship_once():
