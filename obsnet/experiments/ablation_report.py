@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import expit, logit
 
 from obsnet.errors import OutputError
 from obsnet.evaluation.detections import smad
 from obsnet.experiments.ablation import ROWS, Maker, Outcome, Plan, add_variant, results, run
+from obsnet.experiments.ablation_minutes import RANGE_LIMIT_M
 from obsnet.experiments.ablation_records import KINDS
 from obsnet.output import write_text
 from obsnet.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, figure
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 WRONG_PER_HOUR, FALSE_PER_HOUR = 1.0, 0.5
 """What a detector may get wrong over all validation records, and in any of them without a ship: its threshold is the lowest that keeps to both."""
 REACH_BIN_M = 5000.0
+RELIABILITY_ROWS = ("analytic", "analytic recalibrated", "learned both")
 COLOURS = (BLUE, SKY, GREEN, YELLOW, ORANGE, VERMILLION, PURPLE)
 
 
@@ -181,14 +184,69 @@ def text(scores: pd.DataFrame) -> str:
 
 
 def write(plan: Plan, folder: str | Path, out: str | Path) -> pd.DataFrame:
-    """Write ablation.csv, ablation.txt and ablation.png into `out`."""
+    """Write ablation.csv, ablation.txt, ablation.png and reliability.png into `out`."""
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     scores = table(plan, folder)
     write_text(out / "ablation.csv", scores.to_csv(index=False, float_format="%.5g"))
     write_text(out / "ablation.txt", text(scores) + "\n")
     draw(scores, out / "ablation.png")
+    draw_reliability(results(plan, folder, False), out / "reliability.png")
     return scores
+
+
+def reliability(minutes: pd.DataFrame, sensor: str) -> pd.DataFrame:
+    """How often a ship is there by how probable a detector says it is, in ten bins of probability.
+
+    Parameters
+    ----------
+    minutes : of `obsnet.experiments.ablation_minutes.minute_table`, of one detector; a ship is there for range within 50 km. The
+        prior odds of a ship are the minutes' own.
+
+    Returns
+    -------
+    DataFrame with columns said (mean probability), seen (share of minutes with a ship), minutes; bins without minutes are left out.
+    """
+    minutes = minutes[minutes[f"{sensor}_llr"].notna()]
+    nearest = minutes["range_true_m"]
+    there = (nearest <= RANGE_LIMIT_M if sensor == "range" else nearest.notna()).to_numpy()
+    share = np.clip(there.mean(), 0.01, 0.99)
+    said = expit(minutes[f"{sensor}_llr"].to_numpy(float) + logit(share))
+    table = pd.DataFrame({"said": said, "seen": there, "bin": np.minimum((10 * said).astype(int), 9)})
+    return table.groupby("bin").agg(said=("said", "mean"), seen=("seen", "mean"), minutes=("seen", "size"))
+
+
+def draw_reliability(outcomes: Mapping[str, list[Outcome]], path: Path) -> None:
+    """What rows say of presence against what is so, for each generator and sensor, with the expected calibration error."""
+    rows = [name for name in RELIABILITY_ROWS if name in outcomes]
+    generators = list(dict.fromkeys(o[0] for name in rows for o in outcomes[name]))
+    if not rows:
+        return
+    made = figure(5.0 * len(generators), 9.0)
+    for number, (sensor, generator) in enumerate((s, g) for s in ("azimuth", "range") for g in generators):
+        axes = made.add_subplot(2, len(generators), number + 1, aspect="equal")
+        axes.plot([0, 1], [0, 1], color="black", lw=0.8, ls=":")
+        for name, colour, mark in zip(rows, (BLUE, ORANGE, VERMILLION), "sD^o", strict=False):
+            minutes = pd.concat([o[2] for o in outcomes[name] if o[0] == generator])
+            bins = reliability(minutes[minutes["covered"] == 1], sensor)
+            error = np.average((bins["said"] - bins["seen"]).abs(), weights=bins["minutes"])
+            axes.plot(bins["said"], bins["seen"], color=colour, lw=0.8)
+            size = 6.0 + 200.0 * bins["minutes"] / bins["minutes"].sum()
+            axes.scatter(
+                bins["said"],
+                bins["seen"],
+                s=size,
+                c=colour,
+                marker=mark,
+                alpha=0.8,
+                label=f"{name}: {error:.2f}",
+            )
+        axes.set_xlabel(f"probability of a ship, said by {sensor}")
+        axes.set_ylabel("share of minutes with one")
+        axes.set_title(f"{generator} (simulated), {sensor}; calibration error", fontsize=9, loc="left")
+        axes.legend(fontsize=8, loc="best", markerscale=0.5)
+    made.tight_layout()
+    made.savefig(path)
 
 
 def draw(scores: pd.DataFrame, path: str | Path) -> None:

@@ -197,13 +197,3 @@ def calibration_error(said: np.ndarray, seen: np.ndarray, bins: int = 10) -> flo
         if inside.any():
             total += inside.mean() * abs(float(said[inside].mean()) - float(seen[inside].mean()))
     return float(total)
-
-
-def reliability(said: np.ndarray, seen: np.ndarray, edges: np.ndarray) -> list[tuple[float, float, int]]:
-    """Mean probability said, share seen, and how many, in each bin that has any."""
-    place = np.digitize(said, edges[1:-1])
-    return [
-        (float(said[place == k].mean()), float(seen[place == k].mean()), int((place == k).sum()))
-        for k in range(len(edges) - 1)
-        if (place == k).any()
-    ]

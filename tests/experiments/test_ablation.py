@@ -95,6 +95,22 @@ def test_the_threshold_keeps_every_record_without_a_ship_quiet():
     assert (loud["azimuth_llr"] > chosen["azimuth"]).sum() == 5
 
 
+def test_reliability_of_honest_ratios_is_the_diagonal():
+    rng = np.random.default_rng(3)
+    there = rng.random(40_000) < 0.3
+    llr = rng.normal(np.where(there, 1.0, -1.0), np.sqrt(2.0))
+    minutes = pd.DataFrame(
+        {"range_true_m": np.where(there, 1e4, np.nan), "azimuth_llr": llr, "range_llr": 3.0 * llr}
+    )
+    honest, bold = (ablation_report.reliability(minutes, sensor) for sensor in ("azimuth", "range"))
+    assert honest["minutes"].sum() == 40_000
+    assert (honest["said"] - honest["seen"]).abs().max() < 0.03
+    assert (
+        bold["said"].iloc[0] < bold["seen"].iloc[0] - 0.02
+        and bold["said"].iloc[-1] > bold["seen"].iloc[-1] + 0.05
+    )
+
+
 def test_recalibration_recovers_the_slope_of_overconfident_ratios(tmp_path):
     rng = np.random.default_rng(0)
     minutes, cells, shift = 4000, 72, 3.0
