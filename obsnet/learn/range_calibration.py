@@ -103,7 +103,7 @@ def calibrate(
 ) -> RangeCalibration:
     """Slopes and offsets by maximum likelihood, bounds by the number of independent windows, exponent by wrong tracks.
 
-    Slopes and offsets are those of looks at every minute; the rest is of the detector as it looks, from `start.least` on.
+    All is of looks at every minute, whatever `start.least`: refitted to fewer looks, presence found more false tracks.
     """
     parts = _parts(heard, features)
     odds = _odds(parts.ship)
@@ -122,7 +122,6 @@ def calibrate(
         start, slope=float(np.exp(slope)), offset=offset, cheap_slope=float(np.exp(cheap_slope)), cheap_offset=cheap_offset,
         lowest=-100.0, highest=100.0,
     )  # fmt: skip
-    heard = looked_at(heard, start.least)
     said, seen = _presence(heard, features, fitted)
     spans = sum(np.ptp(record.minutes) for record in heard if len(record.minutes))
     evidence = float(np.log(max(spans / 60.0 / INDEPENDENT_MIN, 10.0)))

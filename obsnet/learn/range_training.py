@@ -56,7 +56,7 @@ class RangeTaskConfig:
     examples: RangeExamplesConfig = field(default_factory=RangeExamplesConfig)
     features: RangeFeaturesConfig = field(default_factory=RangeFeaturesConfig)
     density_step_m: float = 2500.0
-    look: RangeCalibration = field(default_factory=lambda: RangeCalibration(rates=5, least=8.0))
+    look: RangeCalibration = field(default_factory=lambda: RangeCalibration(least=7.0))
     patch_noise: float = 0.3
     context_noise: float = 0.12
 

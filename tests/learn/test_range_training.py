@@ -210,14 +210,13 @@ def test_calibration_makes_overconfidence_honest():
     assert after["nll"] < before["nll"]
 
 
-def test_what_is_not_looked_at_changes_presence_and_not_the_slopes():
+def test_calibration_is_of_looks_at_every_minute():
     records = [heard(k, k % 2 == 0, 4.0) for k in range(6)]
     for record in records:
         record.cheap[::3] *= 0.2
         record.cheap[:, 5, 100] = np.maximum(record.cheap[:, 5, 100], 9.0 * (np.arange(60) % 3 > 0))
     every, some = (calibrate(records, start=RangeCalibration(least=least)) for least in (0.0, 8.0))
-    assert (some.slope, some.offset, some.cheap_slope) == (every.slope, every.offset, every.cheap_slope)
-    assert some.presence_said != every.presence_said
+    assert replace(some, least=0.0) == every
     seen = looked_at(records, 8.0)[0]
     assert np.isnan(seen.network[::3]).all()
     np.testing.assert_array_equal(seen.network[1::3], records[0].network[1::3])
