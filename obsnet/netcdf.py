@@ -48,6 +48,8 @@ class TimeWriter:
             for name, values in _real(block).items():
                 self._extend(name, pack(name, values.transpose("time", ...).values))
         except OSError as error:
+            if isinstance(error, OutputError):
+                raise
             raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from None
         self._require_written()
 
@@ -102,6 +104,7 @@ class TimeWriter:
 
         with h5netcdf.File(self._bytes, "w") as file:
             self._lay_out(file, block)
+        self._require_written()
         # Every growth through h5netcdf asks each variable of each dimension for its length: 5 ms a variable.
         return h5py.File(self._bytes, "r+")
 

@@ -36,6 +36,10 @@ class Detector(Protocol):
         ...
 
 
+TIE = np.float32(1e-3)
+"""Nats by which cells of a map do not differ: of such the first is read off, however the record was cut."""
+
+
 def joined(parts: list[xr.Dataset]) -> xr.Dataset:
     """Datasets of consecutive minutes in one; none give one without minutes."""
     if not parts:
@@ -195,7 +199,8 @@ def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.D
         with np.errstate(divide="ignore"):
             log_prior = np.log(np.maximum(range_m, 0.0)).astype(np.float32)[:, None]
         for minute in ranged:
-            best = int((maps["range_llr"].values[minute] + log_prior).argmax())
+            score = maps["range_llr"].values[minute] + log_prior
+            best = int((score >= score.max() - TIE).argmax())
             table["range_m"][minute] = range_m[best // len(rate)]
             table["range_rate_mps"][minute] = rate[best % len(rate)]
     return pd.DataFrame({"time": maps["time"].values, "coverage": covered, **table})
