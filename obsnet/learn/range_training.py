@@ -48,7 +48,7 @@ class RangeTaskConfig:
     ----------
     examples : how hypotheses are drawn. features : what is seen of them.
     density_step_m : bins of the density of true ranges, which is the prior of the loss.
-    look : where the network looks, chosen by the likelihood of validation minutes, and the cheap score's bound; calibration fits the rest.
+    look : where the network looks, and the cheap score's bound; calibration fits the rest.
     patch_noise, context_noise : standard deviations of noise added to patches and to the rest of the features in training,
         so that no record is known again by its exact geometry.
     """
