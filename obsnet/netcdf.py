@@ -10,9 +10,16 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from xarray.backends import BackendArray, BackendEntrypoint
+from xarray.core.indexing import (
+    ExplicitIndexer,
+    IndexingSupport,
+    LazilyIndexedArray,
+    explicit_indexing_adapter,
+)
 
 from obsnet.errors import OutputError
-from obsnet.layout import to_posix
+from obsnet.layout import from_posix, to_posix
 
 UNITS = {"frequency": "Hz", "spectrogram_frequency": "Hz", "quefrency": "s"}
 """Units of the coordinates that are not given with them."""
@@ -22,6 +29,8 @@ PACKED = {"range_llr": 0.05}
 
 _FILL = np.int16(-32768)
 _CELLS_AT_ONCE = 1 << 17
+_ROWS_AT_ONCE = 64
+_BINDING = ("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "scale_factor")
 
 
 class TimeWriter:
@@ -168,40 +177,83 @@ class _PatientFile(io.FileIO):
 
 
 def read(path: str | Path) -> xr.Dataset:
-    """Open a file of `TimeWriter` lazily; pairs ``x_real``, ``x_imag`` come back as complex ``x`` when loaded."""
-    from xarray.backends import (
-        H5netcdfBackendEntrypoint,
-    )  # by its name, xarray would import all backends that it finds
+    """Open a file of `TimeWriter` lazily; pairs ``x_real``, ``x_imag`` come back as complex ``x`` when loaded.
 
-    return xr.open_dataset(path, engine=H5netcdfBackendEntrypoint)
-
-
-def rows(values: xr.DataArray, index: np.ndarray) -> np.ndarray:
-    """Chosen rows along `time`, float32: a packed variable still on disk is read past xarray, which takes ten times as long.
-
-    Parameters
-    ----------
-    values : DataArray whose first dim is time, in memory or lazily from `read`.
-    index : int array, increasing.
+    Raises
+    ------
+    OSError, KeyError, ValueError : the file is not there, or not one of `TimeWriter`.
     """
-    name, path = str(values.name), values.encoding.get("source")
-    if not path or name not in PACKED or values.variable._in_memory or not len(index):
-        return values.isel(time=index).values.astype(np.float32, copy=False)
-    chosen = np.empty((len(index), *values.shape[1:]), np.float32)
-    import h5netcdf
+    return xr.open_dataset(path, engine=_Grown)
 
-    with h5netcdf.File(path, "r") as file:
-        packed = file.variables[name]
-        if packed.shape != values.shape:
-            return values.isel(time=index).values.astype(np.float32, copy=False)
-        for start in range(0, len(index), 64):
-            part = index[start : start + 64]
-            if part[-1] - part[0] < 4 * len(part):
-                block = packed[part[0] : part[-1] + 1][part - part[0]]
-            else:
-                block = np.stack([packed[row] for row in part])
-            chosen[start : start + 64] = unpack(name, block)
-    return chosen
+
+class _Grown(BackendEntrypoint):
+    """Files of `TimeWriter`, past h5netcdf, which asks the file for every dimension of every variable: ten times as long."""
+
+    open_dataset_parameters = ("filename_or_obj", "drop_variables")
+
+    def open_dataset(self, filename_or_obj: Any, *, drop_variables: Any = None) -> xr.Dataset:
+        import h5py
+
+        path = Path(filename_or_obj)
+        with h5py.File(path, "r") as file:
+            stored = dict(file.items())
+            axes = {name for name, values in stored.items() if values.is_scale}
+            coords = {name: (name, stored[name][:], _attrs(stored[name])) for name in axes - {"time"}}
+            coords["time"] = ("time", from_posix(stored["time"][:]), {"standard_name": "time"})
+            variables = {
+                name: (_dims(file, values), LazilyIndexedArray(_Stored(path, name, values)), _attrs(values))
+                for name, values in stored.items()
+                if name not in axes
+            }
+            return xr.Dataset(variables, coords, _attrs(file))
+
+
+class _Stored(BackendArray):
+    """A variable on disk, read and unpacked a few rows at a time."""
+
+    def __init__(self, path: Path, name: str, stored: Any) -> None:
+        self.path, self.name, self.shape = path, name, stored.shape
+        self.dtype = np.dtype(np.float32 if name in PACKED else stored.dtype)
+
+    def __getitem__(self, key: ExplicitIndexer) -> np.ndarray:
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._take)
+
+    def _take(self, key: tuple[Any, ...]) -> np.ndarray:
+        import h5py
+
+        first, *rest = key
+        index = np.arange(self.shape[0])[first]
+        chosen = np.empty((index.size, *self.shape[1:]), self.dtype)
+        with h5py.File(self.path, "r") as file:
+            stored = file[self.name]
+            if stored.shape != self.shape:
+                raise OSError(f"{self.path} was written anew; open it again")
+            for start in range(0, index.size, _ROWS_AT_ONCE):
+                part = index.reshape(-1)[start : start + _ROWS_AT_ONCE]
+                if part[-1] - part[0] < 4 * len(part):
+                    block = stored[part[0] : part[-1] + 1]
+                    block = block if len(block) == len(part) else block[part - part[0]]
+                else:
+                    block = np.stack([stored[row] for row in part])
+                chosen[start : start + _ROWS_AT_ONCE] = unpack(self.name, block)
+        for axis, part in enumerate(rest, 1):  # integers last: they take their axis away
+            if not isinstance(part, (int, np.integer)):
+                chosen = chosen[(slice(None),) * axis + (part,)]
+        numbers = (part if isinstance(part, (int, np.integer)) else slice(None) for part in rest)
+        return chosen[(0 if index.ndim == 0 else slice(None), *numbers)]
+
+
+def _dims(file: Any, stored: Any) -> tuple[str, ...]:
+    return tuple(file[axis[0]].name.removeprefix("/") for axis in stored.attrs["DIMENSION_LIST"])
+
+
+def _attrs(stored: Any) -> dict[str, Any]:
+    """What a file says of itself or of a variable, without what binds variables to dimensions and integers to values."""
+    return {
+        name: value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+        for name, value in stored.attrs.items()
+        if name not in _BINDING and not name.startswith("_")
+    }
 
 
 def join_complex(dataset: xr.Dataset) -> xr.Dataset:

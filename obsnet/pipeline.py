@@ -25,7 +25,15 @@ from obsnet.detectors.analytic import (
 )
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
 from obsnet.detectors.background import BackgroundDirection
-from obsnet.detectors.maps import LikelihoodMaps, coverage, detections, joined, presence, window_bounds
+from obsnet.detectors.maps import (
+    MARGINAL,
+    LikelihoodMaps,
+    coverage,
+    detections,
+    joined,
+    presence,
+    window_bounds,
+)
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -47,6 +55,11 @@ if TYPE_CHECKING:
 _HORIZONTALS = {"east", "north"}
 
 NEEDS_FULL_AZIMUTHS = "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
+
+_MARGINAL = {
+    "long_name": "log-likelihood ratio against no ship, range rate marginalised over an even prior",
+    "units": "1",
+}
 
 _STRETCH = 30
 """Minutes whose maps are made at a time."""
@@ -318,8 +331,12 @@ class Pipeline:
         parts = [joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
-        ratios = presence(maps)
-        features = coming.features
+        features, marginal = coming.features, None
+        if "range_llr" in maps:
+            marginal = np.empty(maps["range_llr"].shape[:2], np.float32)
+            features = features.assign_coords(range=maps["range"])
+            features[MARGINAL] = ("time", "range"), marginal, _MARGINAL
+        ratios = presence(maps, marginal)
         for name in ("approaching", "leaving"):
             if name in ratios:
                 features[f"{name}_llr"] = ("time", ratios[name].to_numpy(np.float32), {"units": "1"})

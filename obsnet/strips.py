@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from obsnet.detectors.maps import LikelihoodMaps, range_rate_marginal
+from obsnet.detectors.maps import MARGINAL, LikelihoodMaps, range_rate_marginal
 
 LLR = (-30.0, 30.0)
 """Log-likelihood ratios shown, nats."""
@@ -53,7 +53,10 @@ def columns(
     if "azimuth_llr" in maps:
         values = maps["azimuth_llr"].transpose("time", "azimuth").values
         made["azimuth"], axes["azimuth"] = _pooled(values, maps["azimuth"].values, "degrees")
-    if "range_llr" in maps:
+    if MARGINAL in features:
+        values = features[MARGINAL].transpose("time", "range").values
+        made["range"], axes["range"] = _pooled(values, features["range"].values, "m")
+    elif "range_llr" in maps:
         llr = maps["range_llr"].transpose("time", "range", "range_rate").values
         values = range_rate_marginal(llr.astype(np.float32, copy=False))
         made["range"], axes["range"] = _pooled(values, maps["range"].values, "m")

@@ -235,10 +235,10 @@ def test_columns_of_a_window_count_minutes_of_the_whole_run():
 @pytest.mark.parametrize("most", [479, 40])
 def test_range_map_from_disk_is_the_map_in_memory(run, written, most):
     on_disk = read_run(written)
-    assert "range_llr" in on_disk.maps and on_disk.maps["range_llr"].encoding["scale_factor"]
+    assert "range_llr" in on_disk.maps and not on_disk.maps["range_llr"].variable._in_memory
     columns = Columns.over(run.maps["time"].values, most)
     weight = run.detections["range_llr"].to_numpy(float)
-    values = range_columns(on_disk.maps, columns, weight)
+    values = range_columns(on_disk.maps, on_disk.features, columns, weight)
     llr = run.maps["range_llr"].values.astype(float)[columns.strongest(weight)]
     np.testing.assert_allclose(values, np.log(np.exp(llr).mean(axis=2)), atol=0.03)
 
@@ -249,7 +249,8 @@ def test_minutes_without_data_stay_blank_from_disk(run, tmp_path):
     holed.maps["range_llr"][100:140] = np.nan
     holed.write(tmp_path)
     columns = Columns.over(run.maps["time"].values, 1000)
-    values = range_columns(read_run(tmp_path).maps, columns, np.zeros(len(run.detections)))
+    back = read_run(tmp_path)
+    values = range_columns(back.maps, back.features, columns, np.zeros(len(run.detections)))
     assert (
         np.isnan(values[100:140]).all()
         and np.isfinite(values[:100]).all()

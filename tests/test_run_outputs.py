@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+from shutil import copyfile
 
 import numpy as np
 import obspy
@@ -12,7 +13,7 @@ import xarray as xr
 from pyproj import Geod
 from threadpoolctl import threadpool_info
 
-from obsnet import Station, detect
+from obsnet import Station, detect, netcdf
 from obsnet.kinematics import StraightCourse
 from obsnet.tables import geojson
 from obsnet.trackers.track import Track
@@ -140,7 +141,46 @@ def test_the_spectrogram_has_units(finished):
     with xr.open_dataset(finished / "features.nc") as features:
         assert features["power"].attrs["units"] == "Pa2"
         axes = {name: coord.attrs["units"] for name, coord in features.coords.items() if name != "time"}
-    assert axes == {"spectrogram_frequency": "Hz", "frequency": "Hz", "quefrency": "s"}
+    assert axes == {"spectrogram_frequency": "Hz", "frequency": "Hz", "quefrency": "s", "range": "m"}
+
+
+def test_the_ratio_against_range_alone_lies_beside_the_map(finished):
+    with xr.open_dataset(finished / "maps.nc") as maps, xr.open_dataset(finished / "features.nc") as features:
+        llr = maps["range_llr"].transpose("time", "range", "range_rate").values.astype(float)
+        marginal = np.log(np.exp(llr).mean(axis=2))
+        np.testing.assert_allclose(features["range_marginal_llr"].values, marginal, atol=0.06)
+        np.testing.assert_array_equal(features["range"], maps["range"])
+
+
+@pytest.mark.parametrize("name", ["maps.nc", "features.nc"])
+def test_files_are_read_as_xarray_reads_them(finished, name):
+    with xr.open_dataset(finished / name, engine="h5netcdf") as whole:
+        read = netcdf.read(finished / name)
+        xr.testing.assert_identical(read.drop_attrs(), whole.drop_attrs())
+        for variable in (set(whole.variables) | set(read.variables)) - {"time"}:
+            assert read[variable].attrs == whole[variable].attrs, variable
+        for part in (
+            {"time": 5},
+            {"time": [7, 3, 3, 9]},
+            {"time": [0, whole.sizes["time"] - 1]},
+            {"time": slice(40, 3, -7)},
+            {"time": slice(0, 0)},
+            {"time": []},
+            {"time": 4, "range": 3},
+            {"range": [30, 1], "time": slice(5, 30, 3)},
+        ):
+            part = {dim: at for dim, at in part.items() if dim in whole.dims}
+            xr.testing.assert_equal(netcdf.read(finished / name).isel(part).load(), whole.isel(part).load())
+
+
+def test_a_file_written_anew_is_not_read_as_the_old_one(finished, tmp_path):
+    path = tmp_path / "maps.nc"
+    copyfile(finished / "maps.nc", path)
+    old = netcdf.read(path)
+    with netcdf.TimeWriter(path) as writer:
+        writer.append(netcdf.read(finished / "maps.nc").isel(time=slice(0, 3)).load())
+    with pytest.raises(OSError, match="open it again"):
+        old["range_llr"].load()
 
 
 def test_run_json_says_how(finished):

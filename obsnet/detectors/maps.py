@@ -38,6 +38,8 @@ class Detector(Protocol):
 
 TIE = np.float32(1e-3)
 """Nats by which cells of a map do not differ: of such the first is read off, however the record was cut."""
+MARGINAL = "range_marginal_llr"
+"""Name, among the features of a run, of the ratio against range alone (time, range)."""
 
 
 def joined(parts: list[xr.Dataset]) -> xr.Dataset:
@@ -113,14 +115,21 @@ def range_rate_marginal(range_llr: np.ndarray) -> np.ndarray:
 
 
 def range_presence(
-    range_llr: np.ndarray, range_m: np.ndarray, range_rate: np.ndarray
+    range_llr: np.ndarray, range_m: np.ndarray, range_rate: np.ndarray, marginal: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """Log marginal posterior ratios of presence: of any ship, of an `approaching` and of a `leaving` one.
 
     The prior is proportional to range and uniform in range rate (paper's eqs 20, 22); for a closing or an opening ship it is
     the same over half of the range rates (eq. 25).
+
+    Parameters
+    ----------
+    range_llr : (n_minutes, n_range, n_rate) float32. range_m, range_rate : m, m/s.
+    marginal : array (n_minutes, n_range) to take the ratio against range alone, as `range_rate_marginal` but not less than
+        85 nats below a minute's greatest ratio.
     """
     prior = (np.maximum(range_m, 0.0) / np.maximum(range_m, 0.0).sum()).astype(np.float32)
+    even = np.full(len(range_rate), 1.0 / len(range_rate), np.float32)
     top = np.empty(len(range_llr), np.float32)
     per_rate = np.empty((len(range_llr), len(range_rate)), np.float32)
     for first in range(0, len(range_llr), _MINUTES):
@@ -131,6 +140,9 @@ def range_presence(
         raised = range_llr[part] - top[part, None, None]
         np.exp(np.maximum(raised, np.float32(-45.0), out=raised), out=raised)
         np.matmul(prior, raised, out=per_rate[part])
+        if marginal is not None:
+            np.log(raised @ even, out=marginal[part])
+            marginal[part] += top[part, None]
     with np.errstate(divide="ignore"):
         return {
             name: np.log(per_rate[:, chosen].mean(axis=1)) + top
@@ -142,8 +154,10 @@ def range_presence(
         }
 
 
-def presence(maps: LikelihoodMaps) -> pd.DataFrame:
+def presence(maps: LikelihoodMaps, marginal: np.ndarray | None = None) -> pd.DataFrame:
     """Log presence ratios of the maps, as the segmentation takes them: indexed by s since 1970, NaN without coverage.
+
+    `marginal` is taken as by `range_presence`.
 
     Raises
     ------
@@ -157,7 +171,9 @@ def presence(maps: LikelihoodMaps) -> pd.DataFrame:
     if "azimuth_llr" in maps:
         columns["azimuth"] = azimuth_presence(maps["azimuth_llr"].values)
     if "range_llr" in maps:
-        columns |= range_presence(maps["range_llr"].values, maps["range"].values, maps["range_rate"].values)
+        columns |= range_presence(
+            maps["range_llr"].values, maps["range"].values, maps["range_rate"].values, marginal
+        )
     table = pd.DataFrame(columns, index=to_posix(maps["time"].values))
     for name in ("azimuth", "range"):
         if f"{name}_llr" in maps:

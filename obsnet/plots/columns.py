@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from obsnet import netcdf
-from obsnet.detectors.maps import range_rate_marginal
+from obsnet.detectors.maps import MARGINAL, range_rate_marginal
 from obsnet.layout import to_posix
 
 _ROWS_AT_ONCE = 2048
@@ -96,28 +95,31 @@ class Columns:
 
 def azimuth_columns(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
     """Log-likelihood ratios (column, azimuth), of each column's minute of greatest weight; NaN without data."""
-    llr = maps["azimuth_llr"].transpose("time", "azimuth")
-    chosen = columns.strongest(weight)
-    shown = chosen >= 0
-    out = np.full((columns.count, llr.sizes["azimuth"]), np.nan, np.float32)
-    if shown.any():
-        out[shown] = llr.isel(time=chosen[shown]).values
-    return out
+    return _chosen(maps["azimuth_llr"].transpose("time", "azimuth"), columns, weight)
 
 
-def range_columns(maps: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
-    """Log-likelihood ratios (column, range), range rate marginalised; NaN without data.
-
-    Only each column's minute of greatest weight is read, a few columns at a time.
-    """
+def range_columns(maps: xr.Dataset, features: xr.Dataset, columns: Columns, weight: np.ndarray) -> np.ndarray:
+    """Log-likelihood ratios (column, range), range rate marginalised, of each column's minute of greatest weight; NaN without data."""
+    if MARGINAL in features:
+        return _chosen(features[MARGINAL].transpose("time", "range"), columns, weight)
     llr = maps["range_llr"].transpose("time", "range", "range_rate")
+    return _chosen(llr, columns, weight, range_rate_marginal)
+
+
+def _chosen(
+    values: xr.DataArray,
+    columns: Columns,
+    weight: np.ndarray,
+    transform: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> np.ndarray:
+    """Each column's minute of greatest weight, read and transformed a few at a time: (column, cell)."""
     chosen = columns.strongest(weight)
     shown = np.flatnonzero(chosen >= 0)
-    out = np.full((columns.count, llr.sizes["range"]), np.nan, np.float32)
-    at_once = max(1, _CELLS_AT_ONCE // (llr.sizes["range"] * llr.sizes["range_rate"]))
+    out = np.full((columns.count, values.shape[1]), np.nan, np.float32)
+    at_once = max(1, _CELLS_AT_ONCE // int(np.prod(values.shape[1:])))
     for begin in range(0, len(shown), at_once):
         part = shown[begin : begin + at_once]
-        out[part] = range_rate_marginal(netcdf.rows(llr, chosen[part]))
+        out[part] = transform(values.isel(time=chosen[part]).values)
     return out
 
 

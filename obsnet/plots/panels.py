@@ -84,7 +84,7 @@ def range_map(ax: Axes, run: Run, columns: Columns, bar: bool = True) -> None:
     if "range_llr" not in run.maps:
         without(ax, "range [km]", NO_RANGE)
         return
-    values = range_columns(run.maps, columns, run.detections["range_llr"].to_numpy(float))
+    values = range_columns(run.maps, run.features, columns, run.detections["range_llr"].to_numpy(float))
     range_km = run.maps["range"].values / 1e3
     picture = image(ax, values, columns, range_km, style.SEQUENTIAL, *_llr_limits(values))
     style.y_axis(ax, "range [km]", 0.0, farthest_km(run))

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from obsnet.ais import ReferenceTrack
+from obsnet.detectors.maps import MARGINAL
 from obsnet.errors import LayoutError
 from obsnet.layout import iso, parse_utc, to_posix
 from obsnet.run import Run, read_run, track_of_row
@@ -130,13 +131,14 @@ class RunFolder(_Folder):
             return {"time": [], "strips": {}}
         parts: list[dict[str, np.ndarray]] = []
         axes: dict[str, Axis] = {}
+        features = self._run.features
+        features = features[[name for name in ("power", MARGINAL) if name in features]]
+        maps = self._run.maps.drop_vars("range_llr" if MARGINAL in features else [])
         for part in np.array_split(chosen, max(1, len(chosen) // 120)):
             at = {"time": part}
             made, axes = columns(
-                self._run.maps.isel(at).load(), self._run.features[["power"]].isel(at).load()
-                if "power" in self._run.features else self._run.features[[]].isel(at),
-                self._run.config.spectra.window_s,
-            )  # fmt: skip
+                maps.isel(at).load(), features.isel(at).load(), self._run.config.spectra.window_s
+            )
             parts.append(made)
         whole = {name: np.concatenate([part[name] for part in parts]) for name in axes}
         return _strips(self._seconds[chosen], whole, plain(axes))

@@ -210,11 +210,11 @@ class _Finder:
 
         A second ship is looked for `jointly`: the first one's ghost ranges have no azimuth of their own.
         """
-        coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(2.0, 10.0, 1.0))
+        coarse = self._score_maps(azimuth_llr, range_llr, jointly, pool=7, stds=(980.0, 10.0, 0.5))
         starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
         if not starts:
             return None
-        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(4.0, 3.0, 1.0))
+        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(280.0, 3.0, 0.5))
         best, point = 0.0, None
         for start in starts:
             best, point = self._level(start, MEDIUM, fine, best, point)
@@ -432,8 +432,9 @@ class _Finder:
         pool: int,
         stds: tuple[float, float, float],
     ) -> ScoreMaps:
-        """Score maps at one smoothing: range bins (of `pool` grid steps), azimuth [deg], range rate bins."""
+        """Score maps at one smoothing: range [m], after means over `pool` grid steps, azimuth [deg], range rate [m/s]."""
         config, n = self.config, len(self.tiles)
+        spacing, rate_step = (float(axis[1] - axis[0]) for axis in (self.range_m, self.rate))
         step = float(self.azimuth[1] - self.azimuth[0])
         azimuth_score = np.zeros((n, len(self.azimuth)), np.float32)
         if azimuth_llr is not None:
@@ -442,12 +443,11 @@ class _Finder:
             )
         range_score = np.zeros((n, 2, 2), np.float32)
         if range_llr is not None:
+            bins = stds[0] / (spacing * pool), stds[2] / rate_step
             range_score = range_scores(
-                range_llr, pool, (stds[0], stds[2]), config.tile_bound, config.range_detection_probability
+                range_llr, pool, bins, config.tile_bound, config.range_detection_probability
             )
-        spacing = float(self.range_m[1] - self.range_m[0])
         first = float(self.range_m[0]) + spacing * (pool - 1) / 2
-        rate_step = float(self.rate[1] - self.rate[0])
         geometry = np.array([first, spacing * pool, float(self.rate[0]), rate_step])
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
 

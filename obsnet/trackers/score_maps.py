@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from obsnet import netcdf
 from obsnet.layout import to_posix
 from obsnet.trackers.track import Segment
 
@@ -81,8 +80,8 @@ def tiles(
         return None
 
     def llr(name: str) -> np.ndarray | None:
-        rows = netcdf.rows(maps[name], chosen) if name in maps else None
-        return None if rows is None or np.isnan(rows).all() else rows
+        rows = maps[name].isel(time=chosen).values if name in maps else None
+        return None if rows is None or np.isnan(rows).all() else rows.astype(np.float32, copy=False)
 
     return times[chosen], llr("azimuth_llr"), llr("range_llr")
 
