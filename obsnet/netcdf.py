@@ -21,7 +21,7 @@ from xarray.core.indexing import (
 from obsnet.errors import OutputError
 from obsnet.layout import from_posix, to_posix
 
-UNITS = {"frequency": "Hz", "spectrogram_frequency": "Hz", "quefrency": "s"}
+UNITS = {"frequency": "Hz", "line_frequency": "Hz", "spectrogram_frequency": "Hz", "quefrency": "s"}
 """Units of the coordinates that are not given with them."""
 
 PACKED = {"range_llr": 0.05}

@@ -25,6 +25,7 @@ from obsnet.detectors.analytic import (
 )
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
 from obsnet.detectors.background import BackgroundDirection
+from obsnet.detectors.lines import line_level, line_power
 from obsnet.detectors.maps import (
     MARGINAL,
     LikelihoodMaps,
@@ -44,7 +45,7 @@ from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstro
 from obsnet.signals.held import followed_by, laid_out, per_minute, taken_up, thinned_power
 from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
-from obsnet.trackers.grid_search import GridSearchConfig
+from obsnet.trackers.search_config import GridSearchConfig
 from obsnet.trackers.segmentation import SegmentationConfig
 
 if TYPE_CHECKING:
@@ -133,6 +134,7 @@ class _Coming:
 
     minutes: np.ndarray
     maps: list[list[Future]]
+    lines: xr.DataArray
     features: xr.Dataset
 
 
@@ -177,6 +179,7 @@ class Pipeline:
         self._null: np.ndarray | None = None
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
+        self._lines: xr.DataArray | None = None
         self._follower = _follower(self.table, amplitudes) if config.tracker == "focalization" else None
         self._followed: list[StationScans] = []
         self._next: float | None = None
@@ -193,7 +196,8 @@ class Pipeline:
         finished: list[Minutes] = []
         if self._last is not None and times[0] - self._last > LONG_SILENCE_S:
             finished += self.flush()
-            self._azigram = self._null = self._cepstrogram = self._spectrogram = self._next = None
+            self._azigram = self._null = self._cepstrogram = self._spectrogram = self._lines = None
+            self._next = None
             if self._learned is not None:
                 self._learned.reset()
         if self.config.tracker == "bernoulli" and not set(spectra) >= {*_HORIZONTALS, "p"}:
@@ -281,7 +285,7 @@ class Pipeline:
         )
         for name, stage in self._stages().items():
             stage.restore(_under(state, name))
-        self._azigram, self._cepstrogram, self._spectrogram = (
+        self._azigram, self._cepstrogram, self._spectrogram, self._lines = (
             taken_up(_under(state, name)) for name in self._held()
         )
         self._null = state.get("null")
@@ -296,6 +300,7 @@ class Pipeline:
             "azigram": self._azigram,
             "cepstrogram": self._cepstrogram,
             "spectrogram": self._spectrogram,
+            "lines": self._lines,
         }
 
     def _begin(self, ready: float, spectra: xr.Dataset | None = None) -> None:
@@ -305,6 +310,7 @@ class Pipeline:
         minutes = (self._next or 0.0) + step * np.arange(max(count, 0))
         if spectra is not None:
             self._spectrogram = followed_by(self._spectrogram, thinned_power(spectra))
+            self._lines = followed_by(self._lines, line_power(spectra))
         ranges, azimuths = self._range_maps(minutes, spectra), self._azimuth_maps(minutes, spectra)
         if not len(minutes):
             return
@@ -312,7 +318,9 @@ class Pipeline:
             raise ConfigError(
                 f"{self.station.code} offers neither two horizontals nor a hydrophone; nothing to detect with"
             )
-        self._coming.append(_Coming(minutes, [azimuths, ranges], self._features(minutes)))
+        assert self._lines is not None
+        lines = line_level(self._lines, minutes, self.config.azimuth.window_s)
+        self._coming.append(_Coming(minutes, [azimuths, ranges], lines, self._features(minutes)))
         self._next = float(minutes[-1] + step)
         self._forget(self._next - self.config.azimuth.window_s / 2)
 
@@ -330,6 +338,7 @@ class Pipeline:
     def _finished(self, coming: _Coming) -> Minutes:
         parts = [joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
+        maps["line_level"] = coming.lines
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
         features, marginal = coming.features, None
         if "range_llr" in maps:
@@ -430,8 +439,9 @@ class Pipeline:
             self._null = None if self._null is None else self._null[:, keep]
         if self._cepstrogram is not None:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
-        if self._spectrogram is not None:
-            self._spectrogram = self._spectrogram[:, to_posix(self._spectrogram["time"].values) >= before]
+        if self._spectrogram is not None and self._lines is not None:
+            keep = to_posix(self._spectrogram["time"].values) >= before
+            self._spectrogram, self._lines = self._spectrogram[:, keep], self._lines[:, keep]
 
 
 def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

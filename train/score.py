@@ -23,6 +23,8 @@ from obsnet.experiments.ablation_minutes import minute_table
 from obsnet.pipeline import RunConfig
 from obsnet.run import Run
 
+EXPECTED_CPA_M = 25e3
+"""Ships that come no closer need not be found; a track of one is not false."""
 WITHIN_90 = 1.645
 """Standard deviations of a normal error's 90 % region."""
 
@@ -33,9 +35,8 @@ def ships(run: Run, folder: Path) -> dict[str, Any]:
     where = (station.latitude, station.longitude)
     if pd.read_csv(folder / "ais.csv").empty:
         return {"found": 0, "missed": 0, "false": len(run.tracks), "errors": [], "within": []}
-    said = evaluate(
-        run.detections, run.tracks, reference_tracks(read(folder / "ais.csv", near=where), where), run.delay
-    )
+    about = reference_tracks(read(folder / "ais.csv", near=where), where, max_cpa_m=None)
+    said = evaluate(run.detections, run.tracks, about, run.delay, expected_cpa_m=EXPECTED_CPA_M)
     found = [ship for ship in said.ships if ship.number and ship.track is not None]
     errors = [
         (s.cpa_time_error_s, s.cpa_distance_error_m, s.course_error_deg, s.speed_error_mps) for s in found

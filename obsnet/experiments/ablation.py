@@ -174,7 +174,7 @@ def _compose(row: Row, place: Path, runs: dict[str, tuple[Run, float]], folder: 
     maps = xr.merge(
         [
             azimuth.maps[[n for n in azimuth.maps if str(n).startswith("azimuth")]],
-            ranged.maps[[n for n in ranged.maps if str(n).startswith("range")]],
+            ranged.maps[[n for n in ranged.maps if str(n).startswith(("range", "line"))]],
         ],
         combine_attrs="drop_conflicts",
     )

@@ -33,13 +33,14 @@ def taken_up(arrays: Mapping[str, np.ndarray]) -> xr.DataArray | None:
     return xr.DataArray(arrays["values"], coords, said["dims"], said["name"], said["attrs"])
 
 
+def power_of(spectra: xr.Dataset) -> xr.DataArray:
+    """The component whose power is shown: the pressure, or the ground motion without one."""
+    return spectra[next(name for name in ("p", "down", "north", "east") if name in spectra)]
+
+
 def thinned_power(spectra: xr.Dataset) -> xr.DataArray:
     """Power of the pressure (or of the ground motion without one) in bins of eight, so that a minute is small."""
-    values = (
-        spectra["p"]
-        if "p" in spectra
-        else spectra[next(name for name in ("down", "north", "east") if name in spectra)]
-    )
+    values = power_of(spectra)
     power = values.values.real**2 + values.values.imag**2
     bins = power.shape[0] // 8
     thinned = power[: bins * 8].reshape(bins, 8, -1).mean(axis=1)

@@ -283,15 +283,22 @@ def other_scale(
     slowest, fastest : that a ship may be, m/s.
     """
     scales = np.exp(np.arange(-_SCALES, _SCALES + 1) * _SCALE_STEP)
-    points = np.repeat(point[None], len(scales), axis=0)
-    points[:, [1, 3]] *= scales[:, None]
-    both, _ = score_points(points, tiles, delay, scores)
-    pointing, _ = score_points(points, tiles, delay, scores.without_range())
-    said = both - pointing
+    points, said = at_scales(point, scales, tiles, delay, scores)
     ridge = np.concatenate([[False], (said[1:-1] >= said[:-2]) & (said[1:-1] > said[2:]), [False]])
     ridge &= (np.abs(np.log(scales)) > _APART) & (points[:, 3] > slowest) & (points[:, 3] < fastest)
     found = np.flatnonzero(ridge & (said >= NEARLY * max(said[_SCALES], 0.0)))
     return float(scales[found[said[found].argmax()]]) if found.size else None
+
+
+def at_scales(
+    point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
+) -> tuple[np.ndarray, np.ndarray]:
+    """Courses of so many times the CPA range and speed, (n, 4), and what range maps say for each."""
+    points = np.repeat(point[None], len(scales), axis=0)
+    points[:, [1, 3]] *= scales[:, None]
+    both, _ = score_points(points, tiles, delay, scores)
+    pointing, _ = score_points(points, tiles, delay, scores.without_range())
+    return points, both - pointing
 
 
 def _heard(

@@ -9,13 +9,12 @@ Around the best one the course may bend (`bends`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from obsnet.errors import ConfigError
 from obsnet.kinematics import BentCourse, StraightCourse, wrap180
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
 from obsnet.trackers.course_grid import (
@@ -29,74 +28,12 @@ from obsnet.trackers.course_grid import (
     ranged,
     score_points,
 )
+from obsnet.trackers.line_doppler import BY_LINES, Lines
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import ScoreMaps, above_floor, azimuth_scores, lobe, range_scores, tiles
+from obsnet.trackers.search_config import FINE, MEDIUM, GridSearchConfig, Level
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 
-
-@dataclass(frozen=True)
-class GridSearchConfig:
-    """Prior, likelihood and levels of the grid search.
-
-    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
-    and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
-    reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
-    when no other is. A track must be heard for `shortest_s`.
-    `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
-    to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range).
-    """
-
-    azimuth_detection_probability: float = 0.9
-    range_detection_probability: float = 0.6
-    tile_s: float = 180.0
-    tile_bound: float = 12.0
-    exponent: float = 1.0
-    max_cpa_range_m: float = 50_000.0
-    min_speed_mps: float = 3.0
-    max_speed_mps: float = 15.0
-    candidates: int = 6
-    max_ships: int = 4
-    min_log_bayes_factor: float = 10.0
-    min_log_bayes_factor_next: float = 60.0
-    min_log_bayes_factor_apart: float = 30.0
-    still_deg_per_hour: float = 4.0
-    shortest_s: float = 1800.0
-    range_scale_std: float = 0.005
-    samples: int = 3000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("azimuth_detection_probability", "range_detection_probability"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ConfigError(f"{name} must lie in (0, 1), found {getattr(self, name)}")
-        if not 0.0 < self.min_speed_mps < self.max_speed_mps:
-            raise ConfigError(
-                f"min_speed_mps must lie below max_speed_mps, found {self.min_speed_mps}, {self.max_speed_mps}"
-            )
-        if not 0.0 <= self.range_scale_std < 1.0:
-            raise ConfigError(f"range_scale_std must lie in [0, 1), found {self.range_scale_std}")
-        for name in (
-            "tile_s",
-            "tile_bound",
-            "exponent",
-            "max_cpa_range_m",
-            "candidates",
-            "max_ships",
-            "samples",
-        ):
-            if getattr(self, name) <= 0:
-                raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class _Level:
-    """Steps and half-widths of one level in CPA time [s], CPA range [m], course [deg], speed [m/s]."""
-
-    step: tuple[float, float, float, float]
-    half: tuple[float, float, float, float]
-
-
-MEDIUM = _Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
 TURN_DEG = 30.0
 """How far from a known ship's azimuth sound may still be that ship's."""
 
@@ -120,8 +57,6 @@ COARSE_SHARE = 0.6
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
-
-FINE = _Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
 
 
 def search(
@@ -151,10 +86,11 @@ def search(
     read = tiles(maps, segment, config.tile_s)
     if read is None:
         return []
-    times, azimuth_llr, range_llr = read
+    times, azimuth_llr, range_llr, level = read
     given = {"azimuth_llr": azimuth_llr, "range_llr": range_llr}
     maps = maps.drop_vars([name for name in given if name in maps and given[name] is None])
-    finder = _Finder(maps, times, delay, config, threads)
+    lines = None if level is None or not config.lines else Lines.of(level, maps["line_frequency"].values)
+    finder = _Finder(maps, times, delay, config, threads, lines)
     for track in known:
         # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.
         azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr, finder.heard_m(track))
@@ -185,8 +121,9 @@ class _Finder:
         delay: Callable[[np.ndarray], np.ndarray],
         config: GridSearchConfig,
         threads: int,
+        lines: Lines | None = None,
     ) -> None:
-        self.config, self.threads = config, threads
+        self.config, self.threads, self.lines = config, threads, lines
         self.origin = times[0]
         self.tiles = times - self.origin
         self.azimuth = maps["azimuth"].values if "azimuth_llr" in maps else np.arange(0.0, 360.0, 1.0)
@@ -224,7 +161,35 @@ class _Finder:
         # The evidence is less than the greatest likelihood, by far more than what a finer grid would find.
         if point is None or self.config.exponent * best - self._runs < least:
             return None
-        return self._track(point, fine)
+        return self._track(*self._by_lines(point, fine, least), fine)
+
+    def _by_lines(
+        self, point: np.ndarray, scores: ScoreMaps, least: float
+    ) -> tuple[np.ndarray, tuple[float, float] | None]:
+        """The hypothesis, or the one that fits best at another scale of CPA range and speed if the lines' shift asks for it.
+
+        With the other one come mean and standard deviation of the speed that it asks for, m/s.
+        """
+        start = None
+        if self.lines is not None and self.sees_course:
+            start = self.lines.rescaled(point, self._scales(point), self.tiles, self.delay, scores)
+        if start is None:
+            return point, None
+        best, found = -np.inf, None
+        for nudge in (0.92, 1.0, 1.08):
+            centre = start * np.array([1.0, nudge, 1.0, nudge])
+            best, found = self._level(centre, MEDIUM, scores, best, found)
+        if found is not None:
+            best, found = self._level(found, FINE, scores)
+        if found is None or self.config.exponent * best - self._runs < least:
+            return point, None
+        return found, (float(start[3]), BY_LINES * float(start[3]))
+
+    def _scales(self, point: np.ndarray) -> np.ndarray:
+        """Scales of CPA range and speed that the prior allows."""
+        config, scales = self.config, np.exp(np.arange(-24, 25) * 0.05)
+        allowed = (scales * point[3] >= config.min_speed_mps) & (scales * point[3] <= config.max_speed_mps)
+        return scales[allowed & (scales * abs(point[1]) <= config.max_cpa_range_m)]
 
     def _coarse(self, scores: ScoreMaps, needed: float) -> list[np.ndarray]:
         """The best hypotheses of the whole prior from which a score of `needed` may be reached, apart from each other, best first."""
@@ -261,7 +226,7 @@ class _Finder:
     def _level(
         self,
         centre: np.ndarray,
-        level: _Level,
+        level: Level,
         scores: ScoreMaps,
         best: float = -np.inf,
         point: np.ndarray | None = None,
@@ -272,6 +237,8 @@ class _Finder:
         ]
         cpa_time, cpa_range, course, speed = axes
         speed = speed[(speed >= self.config.min_speed_mps) & (speed <= self.config.max_speed_mps)]
+        if not len(speed):
+            return best, point
         course = course if self.sees_course else centre[2:3]
         grid = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
         bounds = grid.bounds(self.threads)
@@ -287,15 +254,20 @@ class _Finder:
                 point = np.array([cpa_time[t], cpa_range[i], course[q] % 360.0, speed[j]])
         return best, point
 
-    def _track(self, best: np.ndarray, scores: ScoreMaps) -> Track:
-        """The posterior around the best hypothesis, as a track."""
+    def _track(self, best: np.ndarray, speed: tuple[float, float] | None, scores: ScoreMaps) -> Track:
+        """The posterior around the best hypothesis, with what lines say of its speed, as a track."""
         config = self.config
         seen = np.array([True, True, self.sees_course, True])
         silent = self.sees_course and ranged(best, self.tiles, self.delay, scores) < SILENT
         if silent:
             scores = scores.without_range()
 
-        log_likelihood = self._log_likelihood(scores, silent)
+        why = " from the Doppler shift of its lines"
+        if silent and speed is None:
+            if self.lines is not None:
+                speed = self.lines.speed(best, self._scales(best), self.tiles, self.delay, scores)
+            speed, why = (USUAL_MPS, "") if speed is None else (speed, why)
+        log_likelihood = self._log_likelihood(scores, speed)
         known = posterior(best, log_likelihood, self._inside, seen, samples=config.samples, seed=config.seed)
         mean, cov = known.mean, known.covariance
         score, per_tile = score_points(best[None], self.tiles, self.delay, scores)
@@ -313,8 +285,9 @@ class _Finder:
         )
         method = "grid search" if self.sees_course else "grid search, no azimuth maps: course not observed"
         if silent:
-            why = "no range heard" if self.sees_range else "no range maps"
-            method = f"grid search, {why}: speed taken as {USUAL_MPS[0]:g} ± {USUAL_MPS[1]:g} m/s"
+            method = f"grid search, no range {'heard' if self.sees_range else 'maps'}"
+        if speed is not None:
+            method += f": speed taken as {speed[0]:.3g} ± {speed[1]:.2g} m/s{why}"
         elif self.sees_course:
             ghost = other_scale(
                 best, self.tiles, self.delay, scores, config.min_speed_mps, config.max_speed_mps
@@ -334,29 +307,32 @@ class _Finder:
         )
         worth = log_bayes_factor >= config.min_log_bayes_factor and self.believable(track)
         if worth and self.sees_course and self.sees_range:
-            track = self._bent(track, known, scores, silent)
+            track = self._bent(track, known, scores, speed)
         return track
 
     def _log_likelihood(
-        self, scores: ScoreMaps, silent: bool, reach_s: np.ndarray | None = None
+        self, scores: ScoreMaps, speed: tuple[float, float] | None, reach_s: np.ndarray | None = None
     ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Log-likelihood of points and each tile's share of it; of a `silent` ship with the speeds that ships usually have."""
+        """Log-likelihood of points and each tile's share of it; of a ship whose range is not heard with what is known of its speed."""
         exponent, spread = self.config.exponent, self.config.max_speed_mps - self.config.min_speed_mps
 
         def log_likelihood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             total, per_tile = score_points(points, self.tiles, self.delay, scores, reach_s)
-            return exponent * total + (usual(points[:, 3], spread) if silent else 0.0), exponent * per_tile
+            prior = 0.0 if speed is None else usual(points[:, 3], spread, speed)
+            return exponent * total + prior, exponent * per_tile
 
         return log_likelihood
 
-    def _bent(self, track: Track, straight: Posterior, scores: ScoreMaps, silent: bool) -> Track:
+    def _bent(
+        self, track: Track, straight: Posterior, scores: ScoreMaps, speed: tuple[float, float] | None
+    ) -> Track:
         """A believable track, its course marginalised over bends; a bent course where the data ask for it."""
         heard = (np.array([track.start, track.end]) - self.origin - straight.mean[0]) * [-1.0, 1.0]
         reach = np.maximum(heard, 0.0) + MARGIN_S
         config = self.config
         # What a turn explains may be another ship's: it must gain as much as a further ship.
         found = bends(
-            straight, self._log_likelihood(scores, silent, reach), self._inside, reach,
+            straight, self._log_likelihood(scores, speed, reach), self._inside, reach,
             least_of_turn=config.min_log_bayes_factor_next, samples=config.samples, seed=config.seed,
         )  # fmt: skip
         mean = found.mean

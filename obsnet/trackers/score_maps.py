@@ -67,8 +67,8 @@ class ScoreMaps:
 
 def tiles(
     maps: xr.Dataset, segment: Segment, tile_s: float
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None] | None:
-    """Tile times and the maps there, read from disk no further than that; none if there are fewer than three.
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None] | None:
+    """Tile times, and azimuth, range and levels of lines there, read from disk no further than that; none if there are fewer than three.
 
     Maps of which no tile has data are None, as those that are not there.
     """
@@ -79,11 +79,11 @@ def tiles(
     if len(chosen) < 3:
         return None
 
-    def llr(name: str) -> np.ndarray | None:
+    def there(name: str) -> np.ndarray | None:
         rows = maps[name].isel(time=chosen).values if name in maps else None
         return None if rows is None or np.isnan(rows).all() else rows.astype(np.float32, copy=False)
 
-    return times[chosen], llr("azimuth_llr"), llr("range_llr")
+    return times[chosen], there("azimuth_llr"), there("range_llr"), there("line_level")
 
 
 def azimuth_scores(llr: np.ndarray, std_bins: float, bound: float, probability: float) -> np.ndarray:

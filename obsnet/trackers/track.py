@@ -17,9 +17,9 @@ USUAL_MPS = (7.5, 2.0)
 """Mean and standard deviation [m/s] of the speeds of merchant ships, where bearings alone cannot tell speed from distance."""
 
 
-def usual(speed_mps: np.ndarray, spread_mps: float) -> np.ndarray:
-    """Log density of merchant ships' speeds over that of speeds spread evenly over so much."""
-    mean, std = USUAL_MPS
+def usual(speed_mps: np.ndarray, spread_mps: float, known: tuple[float, float] = USUAL_MPS) -> np.ndarray:
+    """Log density of speeds of which mean and standard deviation are `known`, over that of speeds spread evenly over so much."""
+    mean, std = known
     return np.log(spread_mps / (std * np.sqrt(2.0 * np.pi))) - 0.5 * ((speed_mps - mean) / std) ** 2
 
 

@@ -1,0 +1,75 @@
+"""Parameters and levels of the grid search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from obsnet.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class GridSearchConfig:
+    """Prior, likelihood and levels of the grid search.
+
+    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
+    and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
+    reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
+    when no other is. A track must be heard for `shortest_s`.
+    `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
+    to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range). With `lines`, the Doppler shift of a ship's
+    lines has a say in the scale of its distance and speed (`obsnet.trackers.line_doppler`).
+    """
+
+    azimuth_detection_probability: float = 0.9
+    range_detection_probability: float = 0.6
+    tile_s: float = 180.0
+    tile_bound: float = 12.0
+    exponent: float = 1.0
+    max_cpa_range_m: float = 50_000.0
+    min_speed_mps: float = 3.0
+    max_speed_mps: float = 15.0
+    candidates: int = 6
+    max_ships: int = 4
+    min_log_bayes_factor: float = 10.0
+    min_log_bayes_factor_next: float = 60.0
+    min_log_bayes_factor_apart: float = 30.0
+    still_deg_per_hour: float = 4.0
+    shortest_s: float = 1800.0
+    range_scale_std: float = 0.005
+    lines: bool = True
+    samples: int = 3000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth_detection_probability", "range_detection_probability"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ConfigError(f"{name} must lie in (0, 1), found {getattr(self, name)}")
+        if not 0.0 < self.min_speed_mps < self.max_speed_mps:
+            raise ConfigError(
+                f"min_speed_mps must lie below max_speed_mps, found {self.min_speed_mps}, {self.max_speed_mps}"
+            )
+        if not 0.0 <= self.range_scale_std < 1.0:
+            raise ConfigError(f"range_scale_std must lie in [0, 1), found {self.range_scale_std}")
+        for name in (
+            "tile_s",
+            "tile_bound",
+            "exponent",
+            "max_cpa_range_m",
+            "candidates",
+            "max_ships",
+            "samples",
+        ):
+            if getattr(self, name) <= 0:
+                raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Level:
+    """Steps and half-widths of one level in CPA time [s], CPA range [m], course [deg], speed [m/s]."""
+
+    step: tuple[float, float, float, float]
+    half: tuple[float, float, float, float]
+
+
+MEDIUM = Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
+FINE = Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
