@@ -14,6 +14,8 @@ from numba import njit
 
 from obsnet.errors import ConfigError, WaveformError
 
+SINGULAR = 1e-11
+"""Share of a channel's own that the others leave of it, up to which it is theirs: a thousand times what float64 rounds off."""
 BLOCK = 2048
 
 
@@ -173,6 +175,10 @@ def fit(samples: np.ndarray, order: int) -> NoiseModel:
         The record is too short for the order, has missing samples, or channels that are dead or copies.
     """
     triangle, used = _triangle(samples, order)
+    if (np.abs(np.diag(triangle)) <= SINGULAR * np.linalg.norm(triangle, axis=0)).any():
+        raise WaveformError(
+            "the record does not determine a noise model: channels are dead or copy each other"
+        )
     channels = triangle.shape[1] // (order + 1)
     covariance = _innovation_covariance(triangle, used, order, channels)
     past = order * channels
