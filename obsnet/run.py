@@ -44,9 +44,9 @@ Progress = Callable[[float, float], None]
 """Called with seconds of record done and in all."""
 
 NEIGHBOUR_S = 3600.0
+"""A track that ended no longer than this before a segment may explain what is heard in it."""
 BEARINGS_SHORTEST_S = 3600.0
 """Bearings over less say too little of where a ship is, and that it is one."""
-"""A track that ended no longer than this before a segment may explain what is heard in it."""
 
 
 @dataclass

@@ -88,9 +88,6 @@ class AzimuthDetectorConfig:
 class RangeDetectorConfig:
     """Gaussian cepstral range detector: grids, path pairs, and the shape of a cepstral pulse.
 
-    The grids are the paper's. With a range rate every 1 m/s single ships are tracked as well, with half the memory; in the
-    paper's week, where ships are heard at once, speeds come out worse and a further track false.
-
     `centre_frequency_hz` is 15 in the paper's text and 16.5 in its scripts; `pulse` is exp(−x²/2Δτ²) in the text and
     exp(−x²/Δτ²) in the scripts.
     """

@@ -28,7 +28,7 @@ from obsnet.trackers.course_grid import (
     ranged,
     score_points,
 )
-from obsnet.trackers.line_doppler import BY_LINES, Lines
+from obsnet.trackers.line_doppler import Lines, told
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.score_maps import ScoreMaps, above_floor, azimuth_scores, lobe, range_scores, tiles
 from obsnet.trackers.search_config import FINE, MEDIUM, GridSearchConfig, Level
@@ -183,7 +183,7 @@ class _Finder:
             best, found = self._level(found, FINE, scores)
         if found is None or self.config.exponent * best - self._runs < least:
             return point, None
-        return found, (float(start[3]), BY_LINES * float(start[3]))
+        return found, told(start[3])
 
     def _scales(self, point: np.ndarray) -> np.ndarray:
         """Scales of CPA range and speed that the prior allows."""

@@ -23,17 +23,13 @@ WIDTH_BINS, BLUR_BINS = 0.55, 0.8
 CHANCE = 2.0
 """Standard deviations that a pitch may stand out by chance."""
 LEAST_OF_LINES = 300.0
-"""Evidence of lines, nats, below which they do not tell a scale: half of such simulated ships' lines were wrong by a third or more."""
-
+"""Evidence of lines, nats, below which they tell no scale of simulated ships."""
 LINES_SHARE = 0.2
-"""Weight of it beside what range maps say; between 0.06 and 0.4 the same of 26 simulated tracks come out right."""
-
+"""Weight of it beside what range maps say."""
 AGREED = 0.85
 """Share of the greatest evidence of lines from which on they agree to a scale."""
-
 BY_LINES = 0.15
 """Relative standard deviation of a speed that lines tell."""
-
 SAME_SCALE = 0.13
 """Difference of two scales, in natural logarithms, up to which the range maps choose between them."""
 _BASE_HZ = 4.0
@@ -136,8 +132,7 @@ class Lines:
         said = self._say(point, scales, tiles, delay, scores)
         if said is None:
             return None
-        speed = float(point[3] * scales[said.argmax()])
-        return speed, BY_LINES * speed
+        return told(point[3] * scales[said.argmax()])
 
     def rescaled(
         self, point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
@@ -157,6 +152,11 @@ class Lines:
         if near[best] or (near & agreed).any() or together[near].max(initial=-np.inf) >= together[best]:
             return None
         return points[best]
+
+
+def told(speed_mps: float) -> tuple[float, float]:
+    """Mean and standard deviation of a speed that lines tell."""
+    return float(speed_mps), float(BY_LINES * speed_mps)
 
 
 def doppler(point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Delay) -> np.ndarray:

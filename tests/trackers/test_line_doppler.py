@@ -8,7 +8,7 @@ from obsnet.kinematics import StraightCourse
 from obsnet.trackers.course_grid import Delay
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.line_doppler import Lines, doppler
-from tests.trackers.test_grid_search import MINUTES, SEGMENT, T0, delay, heard, maps_of
+from tests.trackers.test_grid_search import MINUTES, SEGMENT, T0, delay, maps_of
 
 FREQUENCY = np.arange(62, 492) / 20.48
 SCALES = np.exp(0.05 * np.arange(-20, 21))
@@ -118,10 +118,3 @@ def test_lines_that_agree_change_nothing():
     (without,) = search(maps, SEGMENT, delay)
     (found,) = search(with_lines(maps, levels(truth, MINUTES, rng)), SEGMENT, delay)
     assert found.motion == without.motion and found.method == without.method
-
-
-def test_heard_agrees_with_the_shift():
-    """The sign: a closing ship's lines lie above their pitch."""
-    course = StraightCourse(T0 + 7200.0, 6_000.0, 60.0, 9.0)
-    _, _, rate = heard(course, MINUTES)
-    assert np.all((shift_of(course, MINUTES) > 1.0) == (rate < 0.0))
