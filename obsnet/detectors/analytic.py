@@ -7,6 +7,7 @@ their grid.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,14 +90,15 @@ class RangeDetectorConfig:
     """Gaussian cepstral range detector: grids, path pairs, and the shape of a cepstral pulse.
 
     `centre_frequency_hz` is 15 in the paper's text and 16.5 in its scripts; `pulse` is exp(−x²/2Δτ²) in the text and
-    exp(−x²/Δτ²) in the scripts.
+    exp(−x²/Δτ²) in the scripts. Over half a window a step of range rate moves a ship by less than a step of range;
+    every third rate is one that the learned detector looks at.
     """
 
     window_s: float = 180.0
     step_s: float = 60.0
     range_step_m: float = 70.0
     max_range_m: float = 50_000.0
-    range_rate_step_mps: float = 0.5
+    range_rate_step_mps: float = 2 / 3
     max_range_rate_mps: float = 13.0
     wander_bins: float = 2.0
     centre_frequency_hz: float = 15.0
@@ -260,7 +262,7 @@ class AnalyticRangeDetector:
         quefrency = cepstrogram["quefrency"].values
         if self._bank is None or not np.array_equal(quefrency, self._bank.quefrency):
             nfft = int(cepstrogram.attrs.get("nfft", 2 * (len(quefrency) - 1)))
-            pulses = cepstral_model(quefrency, self._propagation, self._amplitudes, self.config)
+            pulses = _pulses(quefrency, self._propagation, self._amplitudes, self.config)
             self._bank = MatchedFilters(quefrency, nfft, pulses, self.config)
         return self._bank
 
@@ -290,26 +292,31 @@ def cepstral_model(
     (A_j/A_i) exp(−iωτ_ij) enters log|1 + …| as its real part, whose inverse transform has its pulse at +τ_ij, and
     ∫ S(f) cos(ωτ_ij − Δφ) cos(ωτ) df over a band around f0 is an envelope times cos(2π f0 (τ − τ_ij) + Δφ).
     """
+    return np.stack(list(_pulses(np.asarray(quefrency_s, float), propagation, amplitudes, config)))
+
+
+def _pulses(
+    quefrency_s: np.ndarray, propagation: xr.Dataset, amplitudes: Amplitudes, config: RangeDetectorConfig
+) -> Iterator[np.ndarray]:
+    """Expected cepstrum of one pair after the other, as of `cepstral_model`: (n_range, n_quefrency)."""
     if not set(config.pairs) & set(amplitudes.pairs):
         known = ", ".join(amplitudes.pairs)
         raise ConfigError(f"no amplitude is known of the pairs {', '.join(config.pairs)}; known are {known}")
     range_m = config.range_m
     factor = 2.0 if config.pulse == "text" else 1.0
-    quefrency_s = np.asarray(quefrency_s, float)
-    model = np.zeros((len(config.pairs), len(range_m), len(quefrency_s)))
-    for p, pair in enumerate(config.pairs):
-        if pair not in amplitudes.pairs:
-            continue
-        delay = _interp(tdoa(propagation, pair), range_m)
-        phase = _interp_phase(phase_difference(propagation, pair), range_m)
-        amplitude = amplitudes.evaluate(pair, range_m)
-        amplitude[~(amplitude >= UNHEARD)] = 0.0
-        row, column = np.nonzero(np.abs(quefrency_s - delay[:, None]) <= 4 * config.pulse_width_s)
-        lag = quefrency_s[column] - delay[row]
-        pulse = np.cos(2 * np.pi * config.centre_frequency_hz * lag + phase[row])
-        pulse *= amplitude[row] * np.exp(-(lag**2) / (factor * config.pulse_width_s**2))
-        model[p][row, column] = np.nan_to_num(pulse)
-    return model
+    for pair in config.pairs:
+        model = np.zeros((len(range_m), len(quefrency_s)))
+        if pair in amplitudes.pairs:
+            delay = _interp(tdoa(propagation, pair), range_m)
+            phase = _interp_phase(phase_difference(propagation, pair), range_m)
+            amplitude = amplitudes.evaluate(pair, range_m)
+            amplitude[~(amplitude >= UNHEARD)] = 0.0
+            row, column = np.nonzero(np.abs(quefrency_s - delay[:, None]) <= 4 * config.pulse_width_s)
+            lag = quefrency_s[column] - delay[row]
+            pulse = np.cos(2 * np.pi * config.centre_frequency_hz * lag + phase[row])
+            pulse *= amplitude[row] * np.exp(-(lag**2) / (factor * config.pulse_width_s**2))
+            model[row, column] = np.nan_to_num(pulse)
+        yield model
 
 
 def null_density(phasor: np.ndarray, background: np.ndarray | None, cap: float = 0.95) -> np.ndarray:

@@ -36,15 +36,15 @@ def line_level(power: xr.DataArray, minutes: np.ndarray, window_s: float) -> xr.
     -------
     DataArray (time, line_frequency) float32 [nats], NaN for a minute without frames.
     """
-    values = power.values
-    valid = ~np.isnan(values[0])
-    mean = np.full((len(minutes), len(values)), np.nan, np.float32)
+    frames = np.ascontiguousarray(power.values.T)
+    valid = ~np.isnan(frames[:, 0])
+    mean = np.full((len(minutes), frames.shape[1]), np.nan, np.float32)
     for i, (first, last) in enumerate(
         zip(*window_bounds(to_posix(power["time"].values), minutes, window_s), strict=True)
     ):
-        heard = first + np.flatnonzero(valid[first:last])
-        if heard.size:  # a copy: sums of the same frames round alike wherever they lie in memory
-            mean[i] = values.take(heard, axis=1).mean(axis=1)
+        heard = frames[first:last][valid[first:last]]
+        if len(heard):
+            mean[i] = heard.mean(axis=0)
     level = np.log(np.maximum(mean, np.finfo(np.float32).tiny))
     if len(minutes):
         level -= _broad(level)

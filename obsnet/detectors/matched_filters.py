@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,11 +26,11 @@ class MatchedFilters:
     Parameters
     ----------
     quefrency : s. nfft : samples of the frames that the cepstra are of.
-    pulses : (n_pairs, n_range, n_quefrency) of `cepstral_model`.
+    pulses : (n_range, n_quefrency) of each pair, as of `cepstral_model`.
     """
 
     def __init__(
-        self, quefrency: np.ndarray, nfft: int, pulses: np.ndarray, config: RangeDetectorConfig
+        self, quefrency: np.ndarray, nfft: int, pulses: Iterable[np.ndarray], config: RangeDetectorConfig
     ) -> None:
         self.quefrency, self._config = quefrency, config
         self._kernel = _gaussian(config.wander_bins)
@@ -42,14 +43,14 @@ class MatchedFilters:
         cells = []
         column = self.margin
         for pulse in pulses:
-            heard = np.flatnonzero(np.abs(pulse).max(axis=1) > 0)
+            heard = np.flatnonzero(pulse.any(axis=1))
             if not heard.size:
                 continue
             lo = max(int(heard[0]) - radius - self.margin, 0)
             hi = min(int(heard[-1]) + 1 + radius + self.margin, n_range)
             for first in range(int(heard[0]), int(heard[-1]) + 1, _RANGES):
                 part = slice(first, min(first + _RANGES, int(heard[-1]) + 1))
-                lags = np.flatnonzero(np.abs(pulse[part]).max(axis=0) > 0)
+                lags = np.flatnonzero(pulse[part].any(axis=0))
                 if lags.size:
                     self._add_tile(
                         pulse, part, slice(int(lags[0]), int(lags[-1]) + 1), precision, column + radius - lo

@@ -247,7 +247,7 @@ def _leading_eigenpairs(matrix: np.ndarray, size: int) -> tuple[np.ndarray, np.n
         return values[::-1][:size], vectors[:, ::-1][:, :size]
     single = matrix.astype(np.float32)
     basis = np.random.default_rng(0).standard_normal((len(matrix), size + 8), np.float32)
-    for _ in range(6):
+    for _ in range(4):
         basis, _ = np.linalg.qr(single @ (single @ basis))
     basis = basis.astype(matrix.dtype)
     values, turn = np.linalg.eigh(basis.T @ matrix @ basis)

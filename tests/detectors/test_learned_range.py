@@ -50,7 +50,8 @@ def test_the_map_peaks_at_the_ship(table, cepstra):
     maps = LearnedRangeDetector(table, energies).maps(cepstra, MINUTES)
     llr = maps["range_llr"].values
     assert llr.dtype == np.float32
-    assert llr.shape == (10, 715, 53)
+    grids = RangeDetectorConfig()
+    assert llr.shape == (10, len(grids.range_m), len(grids.range_rate))
     for minute, values in zip(MINUTES, llr, strict=True):
         place, _ = np.unravel_index(values.argmax(), values.shape)
         assert abs(maps["range"].values[place] - RANGE_M - RATE * (minute - START)) < 500.0
