@@ -34,6 +34,7 @@ from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.sinks import FolderSink, MemorySink
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
 from obsnet.trackers.grid_search import search
+from obsnet.trackers.remainder import Ghosts
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import USUAL_MPS, Segment, Track
 
@@ -286,7 +287,8 @@ def segment_tracks(
     run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray], near: list[Track], threads: int = 1
 ) -> list[Track]:
     """Tracks of one segment, given those found up to `NEIGHBOUR_S` before it; strongest first."""
-    new = search(run.maps, segment, delay, run.config.grid_search, threads, near)
+    ghosts = Ghosts(run.table, run.config.range.pairs)
+    new = search(run.maps, segment, delay, run.config.grid_search, threads, near, ghosts)
     if not new and not near and not _range_heard(run, segment):
         new = _by_bearings(run, segment, delay)
     if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:

@@ -250,12 +250,15 @@ def score_points(
     return best, per_tile
 
 
-def ranged(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps) -> float:
-    """Sum of what range maps say for a course, in the tiles in which it is heard and they do."""
+def said(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps) -> tuple[float, float]:
+    """Sums of what range maps and azimuth maps say for a course, each in the tiles in which it is heard and they do."""
     _, both = score_points(point[None], tiles, delay, scores)
     _, pointing = score_points(point[None], tiles, delay, scores.without_range())
     first, last = best_run(both[:, 0])
-    return float(np.maximum(both - pointing, 0.0)[first : last + 1].sum())
+    ranged, pointed = (
+        float(np.maximum(share, 0.0)[first : last + 1].sum()) for share in (both - pointing, pointing)
+    )
+    return ranged, pointed
 
 
 def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:

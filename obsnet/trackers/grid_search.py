@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from obsnet.kinematics import BentCourse, StraightCourse, wrap180
+from obsnet.kinematics import BentCourse, StraightCourse
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
 from obsnet.trackers.course_grid import (
     CourseGrid,
@@ -25,23 +25,18 @@ from obsnet.trackers.course_grid import (
     best_run,
     fixed_source,
     other_scale,
-    ranged,
+    said,
     score_points,
 )
 from obsnet.trackers.line_doppler import Lines, told
 from obsnet.trackers.posterior import Posterior, posterior
-from obsnet.trackers.score_maps import ScoreMaps, above_floor, azimuth_scores, lobe, range_scores, tiles
+from obsnet.trackers.remainder import Ghosts, Remainder
+from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
 from obsnet.trackers.search_config import FINE, MEDIUM, GridSearchConfig, Level
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 
-TURN_DEG = 30.0
-"""How far from a known ship's azimuth sound may still be that ship's."""
-
 LINGERS = 2.0
 """How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
-
-RANGED = 4.0
-"""Range log-likelihood ratio from which a tile has heard a known ship's range."""
 
 LOOSEST = (3600.0, 15_000.0)
 """Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
@@ -49,11 +44,18 @@ LOOSEST = (3600.0, 15_000.0)
 LOOSEST_NEXT = (1800.0, 10_000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
+SHARP, BRIEF = (60.0, 500.0), 2.0 / 3.0
+"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as a ship that passes overhead: of `shortest_s`
+it need be heard so much only, if it moves beyond the doubt that is allowed a ship apart."""
+
 APART = 0.1
 """Share of the time that a ship is heard up to which others may be heard in it too for it to be apart from them."""
 
 COARSE_SHARE = 0.6
 """What the bound of a coarse cell is at least of the best score in it; 0.87 at the least for 46 simulated ships."""
+
+POINTED = 4.0
+"""What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -66,6 +68,7 @@ def search(
     config: GridSearchConfig = GridSearchConfig(),
     threads: int = 1,
     known: Sequence[Track] = (),
+    ghosts: Ghosts | None = None,
 ) -> list[Track]:
     """Tracks of the ships heard within a segment, strongest first; none if nothing speaks for a ship.
 
@@ -76,6 +79,8 @@ def search(
     delay : travel time [s] of the sound against range [m].
     config : GridSearchConfig
     known : tracks found before, in neighbouring segments; what they explain is left out.
+    ghosts : of the table of the range maps; with them a ship is also found that is heard by its range alone for the most part,
+        while the azimuths are a louder one's.
 
     Returns
     -------
@@ -91,23 +96,14 @@ def search(
     maps = maps.drop_vars([name for name in given if name in maps and given[name] is None])
     lines = None if level is None or not config.lines else Lines.of(level, maps["line_frequency"].values)
     finder = _Finder(maps, times, delay, config, threads, lines)
+    left = azimuth_llr, range_llr
     for track in known:
         # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.
-        azimuth_llr, range_llr = finder.without(track, azimuth_llr, range_llr, finder.heard_m(track))
+        left = finder.remainder.without(track, *left, finder.heard_m(track))
     tracks: list[Track] = []
-    # Without azimuths nothing tells a second ship from the first one's ghost ranges.
-    for number in range(config.max_ships if "azimuth_llr" in maps else 1):
-        others = [*tracks, *known]
-        least = config.min_log_bayes_factor
-        if others:
-            least = min(config.min_log_bayes_factor_next, config.min_log_bayes_factor_apart)
-        jointly = bool(number or known) and "azimuth_llr" in maps
-        found = finder.find(azimuth_llr, range_llr, least, jointly)
-        if found is None or found.log_bayes_factor < finder.required(found, others):
-            break
-        if finder.believable(found) and (not others or _is_no_remainder(found)):
-            tracks.append(found)
-        azimuth_llr, range_llr = finder.without(found, azimuth_llr, range_llr)
+    left = finder.one_by_one(tracks, known, *left)
+    if ghosts is not None and finder.sees_course and left[1] is not None and (tracks or known):
+        finder.one_by_one(tracks, known, left[0], finder.remainder.without_ghosts(ghosts, left[1]), ghosts)
     return tracks
 
 
@@ -134,7 +130,41 @@ class _Finder:
         self.sees_range = "range_llr" in maps
         self._runs = float(np.log(len(times) * (len(times) + 1) / 2))
         self.delay = Delay(np.asarray(delay(np.arange(0.0, 150_001.0, 250.0)), float), 250.0)
+        self.remainder = Remainder(
+            times, self.delay, self.azimuth, self.range_m, self.rate, self.ambiguity_deg
+        )
         self._everywhere: CourseGrid | None = None
+
+    def one_by_one(
+        self,
+        tracks: list[Track],
+        known: Sequence[Track],
+        azimuth_llr: np.ndarray | None,
+        range_llr: np.ndarray | None,
+        ghosts: Ghosts | None = None,
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Add what is found to `tracks`, strongest first, until there is no more; the maps without it come back.
+
+        With `ghosts`, of which the maps are free, range speaks for a further ship where azimuth does not, too.
+        """
+        config = self.config
+        # Without azimuths nothing tells a second ship from the first one's ghost ranges.
+        for number in range(config.max_ships - len(tracks) if self.sees_course else 1):
+            others = [*tracks, *known]
+            least = config.min_log_bayes_factor
+            if others:
+                least = min(config.min_log_bayes_factor_next, config.min_log_bayes_factor_apart)
+            jointly = bool(number or known) and self.sees_course and ghosts is None
+            found = self.find(azimuth_llr, range_llr, least, jointly)
+            if found is None or found.log_bayes_factor < self.required(found, others):
+                break
+            pointed = ghosts is None or found.extra["pointed"] >= POINTED
+            if pointed and self.believable(found) and (not others or _is_no_remainder(found)):
+                tracks.append(found)
+            azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
+            if ghosts is not None and range_llr is not None:
+                range_llr = self.remainder.without_ghosts(ghosts, range_llr)
+        return azimuth_llr, range_llr
 
     def find(
         self,
@@ -216,8 +246,8 @@ class _Finder:
             cells = cells[bounds.flat[cells] > least]
             if not cells.size:
                 break
-            said = grid.scores(cells)
-            values.flat[cells], headings.flat[cells] = said.max(axis=1), said.argmax(axis=1)
+            scored = grid.scores(cells)
+            values.flat[cells], headings.flat[cells] = scored.max(axis=1), scored.argmax(axis=1)
             found = apart(values, config.candidates)
         return [
             np.array([cpa_time[t], cpa_range[i], course[headings[t, i, j]], speed[j]]) for t, i, j in found
@@ -246,10 +276,10 @@ class _Finder:
             cells = cells[bounds.flat[cells] > best]
             if not cells.size:
                 break
-            said = grid.scores(cells)
-            cell, q = np.unravel_index(said.argmax(), said.shape)
-            if said[cell, q] > best:
-                best = float(said[cell, q])
+            scored = grid.scores(cells)
+            cell, q = np.unravel_index(scored.argmax(), scored.shape)
+            if scored[cell, q] > best:
+                best = float(scored[cell, q])
                 t, i, j = np.unravel_index(cells[cell], bounds.shape)
                 point = np.array([cpa_time[t], cpa_range[i], course[q] % 360.0, speed[j]])
         return best, point
@@ -258,7 +288,8 @@ class _Finder:
         """The posterior around the best hypothesis, with what lines say of its speed, as a track."""
         config = self.config
         seen = np.array([True, True, self.sees_course, True])
-        silent = self.sees_course and ranged(best, self.tiles, self.delay, scores) < SILENT
+        ranged, pointed = said(best, self.tiles, self.delay, scores)
+        silent = self.sees_course and ranged < SILENT
         if silent:
             scores = scores.without_range()
 
@@ -299,6 +330,7 @@ class _Finder:
         extra = {
             "score": float(score[0]),
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
+            "pointed": pointed,
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }
         start, end = float(self.origin + self.tiles[lo]), float(self.origin + self.tiles[hi])
@@ -370,10 +402,13 @@ class _Finder:
         config = self.config
         slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
         within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
-        long_enough = track.end - track.start >= config.shortest_s - config.tile_s
+        moving = track.extra["log_bayes_factor_fixed"]
+        sharp = track.std[0] < SHARP[0] and track.std[1] < SHARP[1]
+        brief = BRIEF if sharp and moving >= config.min_log_bayes_factor_apart else 1.0
+        long_enough = track.end - track.start >= brief * config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
         located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
-        moves = track.extra["log_bayes_factor_fixed"] >= config.min_log_bayes_factor
+        moves = moving >= config.min_log_bayes_factor
         return bool(long_enough and within_speed and within_range and located and moves)
 
     def required(self, track: Track, others: Sequence[Track]) -> float:
@@ -426,41 +461,6 @@ class _Finder:
         first = float(self.range_m[0]) + spacing * (pool - 1) / 2
         geometry = np.array([first, spacing * pool, float(self.rate[0]), rate_step])
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
-
-    def without(
-        self,
-        track: Track,
-        azimuth_llr: np.ndarray | None,
-        range_llr: np.ndarray | None,
-        reach_m: float = np.inf,
-    ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """The maps with what a track explains made silent, for the search of the next ship; beyond `reach_m` it explains nothing."""
-        emitted = self.origin + self.tiles
-        for _ in range(3):
-            _, distance, _ = track.motion.observables(emitted)
-            emitted = self.origin + self.tiles - self.delay(distance)
-        azimuth, distance, rate = track.motion.observables(emitted)
-        distance = np.where(distance <= reach_m, distance, np.nan)
-        ranged = np.zeros(len(self.tiles), bool)
-        if range_llr is not None:
-            near = abs(self.range_m[None, :] - distance[:, None]) <= 3000.0
-            rates = abs(self.rate[None, :] - rate[:, None]) <= 3.0
-            here = near[:, :, None] & rates[:, None, :]
-            ranged = np.where(here, range_llr, -np.inf).max(axis=(1, 2)) > RANGED
-            range_llr = np.where(here, np.minimum(range_llr, 0.0), range_llr)
-        if azimuth_llr is not None:
-            # A ship that keeps its range but not its azimuth has turned: what is heard nearby is still that ship.
-            explained = np.zeros(azimuth_llr.shape, bool)
-            for turn in range(0, 360, self.ambiguity_deg):
-                beside = abs(wrap180(self.azimuth[None, :] - azimuth[:, None] - turn)) <= TURN_DEG
-                explained |= beside & ranged[:, None]
-                explained |= lobe(azimuth_llr, self.azimuth, azimuth + turn, TURN_DEG)
-            explained &= np.isfinite(distance)[:, None]
-            # Where one ship is loud, a ship anywhere may explain more than none: the next is held against the first.
-            azimuth_llr = above_floor(
-                np.where(explained, np.minimum(azimuth_llr, 0.0), azimuth_llr), explained
-            )
-        return azimuth_llr, range_llr
 
 
 def _is_no_remainder(track: Track) -> bool:

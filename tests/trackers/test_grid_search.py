@@ -179,6 +179,21 @@ def test_a_further_ship_heard_when_no_other_is_needs_less_evidence(monkeypatch, 
     assert len(search(maps, SEGMENT, delay)) == count
 
 
+@pytest.mark.parametrize(
+    ("minutes", "std", "moving", "count"),
+    [(20, (10.0, 150.0), 60.0, 1), (20, (100.0, 150.0), 60.0, 0), (20, (10.0, 900.0), 60.0, 0),
+     (20, (10.0, 150.0), 20.0, 0), (14, (10.0, 150.0), 60.0, 0), (30, (100.0, 900.0), 20.0, 1)],
+)  # fmt: skip
+def test_a_brief_ship_must_be_located_sharply_and_move(monkeypatch, minutes, std, moving, count):
+    """A fast ship that passes overhead is heard for twenty minutes, and where it was is then known well."""
+    course = StraightCourse(T0 + 7000.0, 800.0, 60.0, 12.0)
+    extra = {"heard": 0.9, "log_bayes_factor_fixed": moving}
+    covariance = np.diag([*std, 5.0, 0.5]) ** 2
+    found = iter([Track(MINUTES[100], MINUTES[100 + minutes], course, covariance, 60.0, extra=extra), None])
+    monkeypatch.setattr(_Finder, "find", lambda self, *maps: next(found))
+    assert len(search(maps_of([], MINUTES, np.random.default_rng(1)), SEGMENT, delay)) == count
+
+
 def test_lobe_of_a_ship_ends_where_anothers_begins():
     azimuth = np.arange(360.0)
     row = 10.0 * np.exp(-0.5 * ((azimuth - 100.0) / 6.0) ** 2) + 8.0 * np.exp(
