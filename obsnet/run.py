@@ -33,7 +33,7 @@ from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.sinks import FolderSink, MemorySink
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
-from obsnet.trackers.grid_search import search
+from obsnet.trackers.grid_search import outdoes_steady_sources, search
 from obsnet.trackers.remainder import Ghosts
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import USUAL_MPS, Segment, Track
@@ -287,7 +287,7 @@ def segment_tracks(
     run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray], near: list[Track], threads: int = 1
 ) -> list[Track]:
     """Tracks of one segment, given those found up to `NEIGHBOUR_S` before it; strongest first."""
-    ghosts = Ghosts(run.table, run.config.range.pairs)
+    ghosts = Ghosts(run.table, run.config.range.pairs) if "range_llr" in run.maps else None
     new = search(run.maps, segment, delay, run.config.grid_search, threads, near, ghosts)
     if not new and not near and not _range_heard(run, segment):
         new = _by_bearings(run, segment, delay)
@@ -345,7 +345,9 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
         speed_std_mps=USUAL_MPS[1],
         delay=delay,
     )
-    return [found] if found is not None and found.end - found.start >= BEARINGS_SHORTEST_S else []
+    if found is None or found.end - found.start < BEARINGS_SHORTEST_S:
+        return []
+    return [found] if outdoes_steady_sources(run.maps, found, delay, run.config.grid_search) else []
 
 
 def write_tables(run: Run, folder: Path) -> None:

@@ -6,11 +6,12 @@ import pytest
 import xarray as xr
 
 from obsnet import run as runs
-from obsnet.kinematics import StraightCourse
+from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
 from obsnet.pipeline import RunConfig
 from obsnet.run import Run, segment_tracks
-from obsnet.trackers.track import Segment
+from obsnet.trackers.grid_search import GridSearchConfig, outdoes_steady_sources
+from obsnet.trackers.track import Segment, Track
 
 T0 = 1_369_123_200.0
 SHIP = StraightCourse(T0 + 3600.0, 6000.0, 40.0, 7.5)
@@ -23,7 +24,10 @@ def no_delay(range_m):
 def run_of(azimuth_deg, range_llr=-2.0):
     """A run that heard these azimuths minute by minute, and no range."""
     times = T0 + 60.0 * np.arange(len(azimuth_deg))
-    maps = xr.Dataset(coords={"time": from_posix(times), "azimuth": np.arange(360.0)})
+    turn = wrap180(np.arange(360.0) - np.asarray(azimuth_deg)[:, None])
+    llr = (6.0 * np.exp(-0.5 * (turn / 8.0) ** 2) - 2.0).astype(np.float32)
+    coords = {"time": from_posix(times), "azimuth": np.arange(360.0)}
+    maps = xr.Dataset({"azimuth_llr": (("time", "azimuth"), llr)}, coords)
     presence = pd.DataFrame({"azimuth": 8.0, "range": range_llr}, index=times)
     detections = pd.DataFrame({"azimuth_deg": azimuth_deg})
     return Run(None, RunConfig(), maps, xr.Dataset(), detections, presence, [], [], None)
@@ -50,6 +54,21 @@ def test_azimuths_alone_give_a_track_that_says_so(monkeypatch):
 def test_a_source_that_stays_where_it_is_gives_none(monkeypatch):
     still = (70.0 + 2.0 * np.random.default_rng(3).standard_normal(120)) % 360.0
     assert tracks_of(run_of(still), monkeypatch) == []
+
+
+def test_two_lobes_of_noise_that_take_turns_give_none(monkeypatch):
+    """A ship that passes overhead would come from one and go to the other; these come and go."""
+    rng = np.random.default_rng(3)
+    lobes = np.where(np.repeat(rng.random(24) < 0.5, 5), 345.0, 160.0) + 5.0 * rng.standard_normal(120)
+    made = run_of(lobes % 360.0)
+    assert tracks_of(made, monkeypatch) == []
+    times = made.presence.index.to_numpy()
+    for distance in (300.0, 9000.0):
+        ship = StraightCourse(T0 + 3600.0, distance, 163.0, 7.5)
+        track = Track(times[0], times[-1], ship, np.eye(4), 50.0)
+        assert not outdoes_steady_sources(made.maps, track, no_delay, GridSearchConfig())
+        maps = run_of(ship.observables(times)[0]).maps
+        assert outdoes_steady_sources(maps, track, no_delay, GridSearchConfig())
 
 
 def test_less_than_an_hour_of_azimuths_gives_none(monkeypatch):

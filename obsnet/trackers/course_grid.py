@@ -250,15 +250,32 @@ def score_points(
     return best, per_tile
 
 
-def said(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps) -> tuple[float, float]:
-    """Sums of what range maps and azimuth maps say for a course, each in the tiles in which it is heard and they do."""
+@dataclass(frozen=True)
+class Shares:
+    """What each sensor says for a course in the time in which it is heard.
+
+    Attributes
+    ----------
+    ranged, pointed : sums of what range maps and azimuth maps say, in the tiles in which they speak for it.
+    agreeing : of the sensor that speaks for it in fewer tiles, the share of tiles in which the other does too; 1 where it is
+        but one or two.
+    """
+
+    ranged: float
+    pointed: float
+    agreeing: float
+
+
+def shares(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps) -> Shares:
+    """Sensor by sensor, what speaks for a course."""
     _, both = score_points(point[None], tiles, delay, scores)
-    _, pointing = score_points(point[None], tiles, delay, scores.without_range())
+    _, azimuth = score_points(point[None], tiles, delay, scores.without_range())
     first, last = best_run(both[:, 0])
-    ranged, pointed = (
-        float(np.maximum(share, 0.0)[first : last + 1].sum()) for share in (both - pointing, pointing)
-    )
-    return ranged, pointed
+    held = slice(first, last + 1)
+    pointed, ranged = (np.maximum(part[held, 0], 0.0) for part in (azimuth, both - azimuth))
+    fewer = int(min((pointed > 0).sum(), (ranged > 0).sum()))
+    together = int(((pointed > 0) & (ranged > 0)).sum())
+    return Shares(float(ranged.sum()), float(pointed.sum()), together / fewer if fewer > 2 else 1.0)
 
 
 def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:
@@ -272,6 +289,18 @@ def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_d
         shift = np.round(drift * hours / scores.azimuth_step).astype(int)
         best = max(best, scores.azimuth_score[held, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
     return float(best)
+
+
+def two_steady(azimuth_score: np.ndarray) -> float:
+    """Best score of two sources that stay where they are, in each tile the likelier of them: lobes of noise that take turns.
+
+    Parameters
+    ----------
+    azimuth_score : (n_tiles, n_azimuth) of `ScoreMaps`.
+    """
+    every = max(azimuth_score.shape[1] // 180, 1)
+    some = azimuth_score[:, ::every]
+    return max(float(np.maximum(some, one[:, None]).sum(axis=0).max()) for one in some.T)
 
 
 def other_scale(

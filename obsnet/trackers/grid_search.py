@@ -25,12 +25,13 @@ from obsnet.trackers.course_grid import (
     best_run,
     fixed_source,
     other_scale,
-    said,
     score_points,
+    shares,
+    two_steady,
 )
 from obsnet.trackers.line_doppler import Lines, told
 from obsnet.trackers.posterior import Posterior, posterior
-from obsnet.trackers.remainder import Ghosts, Remainder
+from obsnet.trackers.remainder import Ghosts, Remainder, as_heard
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
 from obsnet.trackers.search_config import FINE, MEDIUM, GridSearchConfig, Level
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
@@ -41,7 +42,7 @@ LINGERS = 2.0
 LOOSEST = (3600.0, 15_000.0)
 """Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
 
-LOOSEST_NEXT = (1800.0, 10_000.0)
+LOOSEST_NEXT = (900.0, 3000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
 SHARP, BRIEF = (60.0, 500.0), 2.0 / 3.0
@@ -56,6 +57,13 @@ COARSE_SHARE = 0.6
 
 POINTED = 4.0
 """What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's."""
+
+AGREEING = 0.5
+"""Share of the tiles in which the sensor that hears a ship less hears it, in which the other one must hear it too: else the course
+is one ship's range and another's azimuth."""
+
+SMOOTHING_DEG = 3.0
+"""Standard deviation by which azimuth maps are smoothed for the finer levels."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -181,7 +189,7 @@ class _Finder:
         starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
         if not starts:
             return None
-        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(280.0, 3.0, 0.5))
+        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(280.0, SMOOTHING_DEG, 0.5))
         best, point = 0.0, None
         for start in starts:
             best, point = self._level(start, MEDIUM, fine, best, point)
@@ -288,8 +296,8 @@ class _Finder:
         """The posterior around the best hypothesis, with what lines say of its speed, as a track."""
         config = self.config
         seen = np.array([True, True, self.sees_course, True])
-        ranged, pointed = said(best, self.tiles, self.delay, scores)
-        silent = self.sees_course and ranged < SILENT
+        heard = shares(best, self.tiles, self.delay, scores)
+        silent = self.sees_course and heard.ranged < SILENT
         if silent:
             scores = scores.without_range()
 
@@ -330,7 +338,9 @@ class _Finder:
         extra = {
             "score": float(score[0]),
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
-            "pointed": pointed,
+            "pointed": heard.pointed,
+            "agreeing": heard.agreeing if self.sees_course and not silent else 1.0,
+            "steady": two_steady(scores.azimuth_score[lo : hi + 1]) if silent else -np.inf,
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }
         start, end = float(self.origin + self.tiles[lo]), float(self.origin + self.tiles[hi])
@@ -409,7 +419,9 @@ class _Finder:
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
         located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
         moves = moving >= config.min_log_bayes_factor
-        return bool(long_enough and within_speed and within_range and located and moves)
+        moves &= track.extra.get("score", 0.0) > track.extra.get("steady", -np.inf)
+        one = track.extra.get("agreeing", 1.0) >= AGREEING
+        return bool(long_enough and within_speed and within_range and located and moves and one)
 
     def required(self, track: Track, others: Sequence[Track]) -> float:
         """The log Bayes factor that a track must reach beside what else is known."""
@@ -461,6 +473,24 @@ class _Finder:
         first = float(self.range_m[0]) + spacing * (pool - 1) / 2
         geometry = np.array([first, spacing * pool, float(self.rate[0]), rate_step])
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
+
+
+def outdoes_steady_sources(
+    maps: xr.Dataset, track: Track, delay: Callable[[np.ndarray], np.ndarray], config: GridSearchConfig
+) -> bool:
+    """Whether azimuth maps speak more for a track than for two sources that stay where they are."""
+    read = tiles(maps, Segment(track.start, track.end), config.tile_s)
+    if read is None or read[1] is None:
+        return False
+    times, azimuth_llr = read[0], read[1]
+    azimuth = maps["azimuth"].values
+    step = float(azimuth[1] - azimuth[0])
+    scores = azimuth_scores(
+        azimuth_llr, SMOOTHING_DEG / step, config.tile_bound, config.azimuth_detection_probability
+    )
+    towards, _, _ = as_heard(track, times, delay)
+    place = np.round((towards - azimuth[0]) / step).astype(int) % len(azimuth)
+    return float(scores[np.arange(len(times)), place].sum()) > two_steady(scores)
 
 
 def _is_no_remainder(track: Track) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -74,6 +75,17 @@ class Ghosts:
         return ranges, rates
 
 
+def as_heard(
+    track: Track, tiles: np.ndarray, delay: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Azimuth [deg], range [m] and range rate [m/s] of a track when what is heard at `tiles` (s since 1970) left it."""
+    emitted = tiles
+    for _ in range(3):
+        _, distance, _ = track.motion.observables(emitted)
+        emitted = tiles - delay(distance)
+    return track.motion.observables(emitted)
+
+
 class Remainder:
     """Maps of one segment's tiles without what is known, which it remembers.
 
@@ -105,7 +117,8 @@ class Remainder:
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The maps with what a track explains made silent, for the search of the next ship; beyond `reach_m` it explains nothing."""
         self._taken.append((track, reach_m))
-        azimuth, distance, rate = self._as_heard(track, reach_m)
+        azimuth, distance, rate = as_heard(track, self._tiles, self._delay)
+        distance = np.where(distance <= reach_m, distance, np.nan)
         ranged = np.zeros(len(self._tiles), bool)
         if range_llr is not None:
             near = abs(self._range_m[None, :] - distance[:, None]) <= NEAR[0]
@@ -131,8 +144,8 @@ class Remainder:
         """Range maps in which the ghosts of all that was taken out are silent too."""
         range_llr = range_llr.copy()
         for track, reach_m in self._taken:
-            _, distance, rate = self._as_heard(track, reach_m)
-            ranges, rates = ghosts.of(distance, rate)
+            _, distance, rate = as_heard(track, self._tiles, self._delay)
+            ranges, rates = ghosts.of(np.where(distance <= reach_m, distance, np.nan), rate)
             first, last, slowest, fastest = (
                 np.searchsorted(axis, at + side * reach)
                 for axis, at, reach in zip(
@@ -146,12 +159,3 @@ class Remainder:
                 cells = range_llr[tile, first[here] : last[here], slowest[here] : fastest[here]]
                 np.minimum(cells, 0.0, out=cells)
         return range_llr
-
-    def _as_heard(self, track: Track, reach_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Azimuth, range and range rate of a track when what the tiles hear left it; ranges NaN beyond `reach_m`."""
-        emitted = self._tiles
-        for _ in range(3):
-            _, distance, _ = track.motion.observables(emitted)
-            emitted = self._tiles - self._delay(distance)
-        azimuth, distance, rate = track.motion.observables(emitted)
-        return azimuth, np.where(distance <= reach_m, distance, np.nan), rate
