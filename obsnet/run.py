@@ -33,9 +33,10 @@ from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.sinks import FolderSink, MemorySink
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
-from obsnet.trackers.grid_search import outdoes_steady_sources, search
+from obsnet.trackers.grid_search import search
 from obsnet.trackers.remainder import Ghosts
 from obsnet.trackers.segmentation import segments
+from obsnet.trackers.steady import outdoes_steady_sources
 from obsnet.trackers.track import USUAL_MPS, Segment, Track
 
 if TYPE_CHECKING:

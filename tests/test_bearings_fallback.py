@@ -10,7 +10,8 @@ from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
 from obsnet.pipeline import RunConfig
 from obsnet.run import Run, segment_tracks
-from obsnet.trackers.grid_search import GridSearchConfig, outdoes_steady_sources
+from obsnet.trackers.search_config import GridSearchConfig
+from obsnet.trackers.steady import outdoes_steady_sources
 from obsnet.trackers.track import Segment, Track
 
 T0 = 1_369_123_200.0

@@ -278,31 +278,6 @@ def shares(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
     return Shares(float(ranged.sum()), float(pointed.sum()), together / fewer if fewer > 2 else 1.0)
 
 
-def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:
-    """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
-    held = np.arange(lo, hi + 1)
-    hours = (tiles[held] - tiles[held].mean()) / 3600.0
-    bins = scores.azimuth_score.shape[1]
-    azimuth = np.arange(bins)
-    best = -np.inf
-    for drift in np.linspace(-still_deg_per_hour, still_deg_per_hour, 9):
-        shift = np.round(drift * hours / scores.azimuth_step).astype(int)
-        best = max(best, scores.azimuth_score[held, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
-    return float(best)
-
-
-def two_steady(azimuth_score: np.ndarray) -> float:
-    """Best score of two sources that stay where they are, in each tile the likelier of them: lobes of noise that take turns.
-
-    Parameters
-    ----------
-    azimuth_score : (n_tiles, n_azimuth) of `ScoreMaps`.
-    """
-    every = max(azimuth_score.shape[1] // 180, 1)
-    some = azimuth_score[:, ::every]
-    return max(float(np.maximum(some, one[:, None]).sum(axis=0).max()) for one in some.T)
-
-
 def other_scale(
     point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps, slowest: float, fastest: float
 ) -> float | None:

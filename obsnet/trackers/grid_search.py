@@ -23,17 +23,16 @@ from obsnet.trackers.course_grid import (
     apart,
     best_first,
     best_run,
-    fixed_source,
     other_scale,
     score_points,
     shares,
-    two_steady,
 )
 from obsnet.trackers.line_doppler import Lines, told
 from obsnet.trackers.posterior import Posterior, posterior
-from obsnet.trackers.remainder import Ghosts, Remainder, as_heard
+from obsnet.trackers.remainder import Ghosts, Remainder
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
-from obsnet.trackers.search_config import FINE, MEDIUM, GridSearchConfig, Level
+from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING_DEG, GridSearchConfig, Level
+from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 
 LINGERS = 2.0
@@ -45,9 +44,11 @@ LOOSEST = (3600.0, 15_000.0)
 LOOSEST_NEXT = (900.0, 3000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
-SHARP, BRIEF = (60.0, 500.0), 2.0 / 3.0
-"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as a ship that passes overhead: of `shortest_s`
-it need be heard so much only, if it moves beyond the doubt that is allowed a ship apart."""
+SHARP = (60.0, 500.0)
+"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as a ship that passes overhead."""
+
+BRIEF = 2.0 / 3.0
+"""Share of `shortest_s` for which such a ship must be heard, if it moves beyond the doubt that is allowed a ship apart."""
 
 APART = 0.1
 """Share of the time that a ship is heard up to which others may be heard in it too for it to be apart from them."""
@@ -56,14 +57,11 @@ COARSE_SHARE = 0.6
 """What the bound of a coarse cell is at least of the best score in it; 0.87 at the least for 46 simulated ships."""
 
 POINTED = 4.0
-"""What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's."""
+"""What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's, and located sharply."""
 
 AGREEING = 0.5
 """Share of the tiles in which the sensor that hears a ship less hears it, in which the other one must hear it too: else the course
 is one ship's range and another's azimuth."""
-
-SMOOTHING_DEG = 3.0
-"""Standard deviation by which azimuth maps are smoothed for the finer levels."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -166,7 +164,7 @@ class _Finder:
             found = self.find(azimuth_llr, range_llr, least, jointly)
             if found is None or found.log_bayes_factor < self.required(found, others):
                 break
-            pointed = ghosts is None or found.extra["pointed"] >= POINTED
+            pointed = ghosts is None or (found.extra["pointed"] >= POINTED and _is_sharp(found))
             if pointed and self.believable(found) and (not others or _is_no_remainder(found)):
                 tracks.append(found)
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
@@ -413,8 +411,7 @@ class _Finder:
         slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
         within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
         moving = track.extra["log_bayes_factor_fixed"]
-        sharp = track.std[0] < SHARP[0] and track.std[1] < SHARP[1]
-        brief = BRIEF if sharp and moving >= config.min_log_bayes_factor_apart else 1.0
+        brief = BRIEF if _is_sharp(track) and moving >= config.min_log_bayes_factor_apart else 1.0
         long_enough = track.end - track.start >= brief * config.shortest_s - config.tile_s
         within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
         located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
@@ -475,22 +472,9 @@ class _Finder:
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
 
 
-def outdoes_steady_sources(
-    maps: xr.Dataset, track: Track, delay: Callable[[np.ndarray], np.ndarray], config: GridSearchConfig
-) -> bool:
-    """Whether azimuth maps speak more for a track than for two sources that stay where they are."""
-    read = tiles(maps, Segment(track.start, track.end), config.tile_s)
-    if read is None or read[1] is None:
-        return False
-    times, azimuth_llr = read[0], read[1]
-    azimuth = maps["azimuth"].values
-    step = float(azimuth[1] - azimuth[0])
-    scores = azimuth_scores(
-        azimuth_llr, SMOOTHING_DEG / step, config.tile_bound, config.azimuth_detection_probability
-    )
-    towards, _, _ = as_heard(track, times, delay)
-    place = np.round((towards - azimuth[0]) / step).astype(int) % len(azimuth)
-    return float(scores[np.arange(len(times)), place].sum()) > two_steady(scores)
+def _is_sharp(track: Track) -> bool:
+    """Whether a track's CPA is located sharply."""
+    return bool(track.std[0] < SHARP[0] and track.std[1] < SHARP[1])
 
 
 def _is_no_remainder(track: Track) -> bool:

@@ -1,0 +1,56 @@
+"""Sources that stay where they are, which a track must outdo: a singing whale, lobes of distant noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import xarray as xr
+
+from obsnet.trackers.remainder import as_heard
+from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, tiles
+from obsnet.trackers.search_config import SMOOTHING_DEG, GridSearchConfig
+from obsnet.trackers.track import Segment, Track
+
+
+def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:
+    """Best score over the tiles lo … hi of a source that hardly moves in azimuth, such as a singing whale."""
+    held = np.arange(lo, hi + 1)
+    hours = (tiles[held] - tiles[held].mean()) / 3600.0
+    bins = scores.azimuth_score.shape[1]
+    azimuth = np.arange(bins)
+    best = -np.inf
+    for drift in np.linspace(-still_deg_per_hour, still_deg_per_hour, 9):
+        shift = np.round(drift * hours / scores.azimuth_step).astype(int)
+        best = max(best, scores.azimuth_score[held, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
+    return float(best)
+
+
+def two_steady(azimuth_score: np.ndarray) -> float:
+    """Best score of two sources that stay where they are, in each tile the likelier of them: lobes of noise that take turns.
+
+    Parameters
+    ----------
+    azimuth_score : (n_tiles, n_azimuth) of `ScoreMaps`.
+    """
+    every = max(azimuth_score.shape[1] // 180, 1)
+    some = azimuth_score[:, ::every]
+    return max(float(np.maximum(some, one[:, None]).sum(axis=0).max()) for one in some.T)
+
+
+def outdoes_steady_sources(
+    maps: xr.Dataset, track: Track, delay: Callable[[np.ndarray], np.ndarray], config: GridSearchConfig
+) -> bool:
+    """Whether azimuth maps speak more for a track than for two sources that stay where they are."""
+    read = tiles(maps, Segment(track.start, track.end), config.tile_s)
+    if read is None or read[1] is None:
+        return False
+    times, azimuth_llr = read[0], read[1]
+    azimuth = maps["azimuth"].values
+    step = float(azimuth[1] - azimuth[0])
+    scores = azimuth_scores(
+        azimuth_llr, SMOOTHING_DEG / step, config.tile_bound, config.azimuth_detection_probability
+    )
+    towards, _, _ = as_heard(track, times, delay)
+    place = np.round((towards - azimuth[0]) / step).astype(int) % len(azimuth)
+    return float(scores[np.arange(len(times)), place].sum()) > two_steady(scores)
