@@ -9,6 +9,7 @@ import xarray as xr
 
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
+from obsnet.trackers.course_grid import shares
 from obsnet.trackers.grid_search import GridSearchConfig, _Finder, search
 from obsnet.trackers.score_maps import lobe
 from obsnet.trackers.track import Segment, Track
@@ -190,6 +191,41 @@ def test_a_brief_ship_must_be_located_sharply_and_move(monkeypatch, minutes, std
     extra = {"heard": 0.9, "log_bayes_factor_fixed": moving}
     covariance = np.diag([*std, 5.0, 0.5]) ** 2
     found = iter([Track(MINUTES[100], MINUTES[100 + minutes], course, covariance, 60.0, extra=extra), None])
+    monkeypatch.setattr(_Finder, "find", lambda self, *maps: next(found))
+    assert len(search(maps_of([], MINUTES, np.random.default_rng(1)), SEGMENT, delay)) == count
+
+
+def test_two_lobes_of_noise_that_take_turns_are_no_ship():
+    """Opposite lobes look like a ship that comes from one and goes to the other, but they come and go."""
+    rng = np.random.default_rng(6)
+    maps = maps_of([], MINUTES, rng)
+    towards = np.where(np.repeat(rng.random(16) < 0.5, 15), 345.0, 162.0) + 4.0 * rng.standard_normal(240)
+    turn = wrap180(AZIMUTH - towards[:, None])
+    maps["azimuth_llr"] = maps["azimuth_llr"] + 8.0 * np.exp(-0.5 * (turn / 6.0) ** 2).astype(np.float32)
+    assert search(maps, SEGMENT, delay) == []
+
+
+@pytest.mark.parametrize(("together", "agreeing"), [(240, 1.0), (0, 0.0)])
+def test_sensors_agree_where_they_hear_a_course_in_the_same_tiles(together, agreeing):
+    """A range heard in the first half and an azimuth in the second may be two ships'."""
+    course = StraightCourse(MINUTES[120], 8000.0, 30.0, 7.0)
+    maps = maps_of([course], MINUTES, np.random.default_rng(2), miss=0.0, ghosts=False)
+    half = np.arange(240) < 120
+    maps["azimuth_llr"][np.flatnonzero(half)[together:]] = -0.1
+    maps["range_llr"][np.flatnonzero(~half)[together:]] = -0.1
+    finder = _Finder(maps, MINUTES[::3], delay, GridSearchConfig(), 1)
+    given = maps["azimuth_llr"].values[::3], maps["range_llr"].values[::3]
+    scores = finder._score_maps(*given, jointly=False, pool=1, stds=(280.0, 3.0, 0.5))
+    point = np.array([MINUTES[120] - MINUTES[0], 8000.0, 30.0, 7.0])
+    assert shares(point, finder.tiles, finder.delay, scores).agreeing == pytest.approx(agreeing, abs=0.1)
+
+
+@pytest.mark.parametrize(("extra", "count"), [({}, 1), ({"agreeing": 0.4}, 0), ({"steady": 400.0}, 0)])
+def test_neither_two_ships_in_one_course_nor_steady_sources_are_a_track(monkeypatch, extra, count):
+    course = StraightCourse(T0 + 7000.0, 8000.0, 60.0, 8.0)
+    covariance = np.diag([30.0, 200.0, 5.0, 0.5]) ** 2
+    said = {"heard": 0.9, "log_bayes_factor_fixed": 200.0, "score": 330.0} | extra
+    found = iter([Track(MINUTES[0], MINUTES[-1], course, covariance, 300.0, extra=said), None])
     monkeypatch.setattr(_Finder, "find", lambda self, *maps: next(found))
     assert len(search(maps_of([], MINUTES, np.random.default_rng(1)), SEGMENT, delay)) == count
 
