@@ -160,6 +160,8 @@ class _Finder:
             least = config.min_log_bayes_factor
             if others:
                 least = min(config.min_log_bayes_factor_next, config.min_log_bayes_factor_apart)
+            if ghosts is not None and self._most_pointed(azimuth_llr) < POINTED:
+                break
             jointly = bool(number or known) and self.sees_course and ghosts is None
             found = self.find(azimuth_llr, range_llr, least, jointly)
             if found is None or found.log_bayes_factor < self.required(found, others):
@@ -171,6 +173,11 @@ class _Finder:
             if ghosts is not None and range_llr is not None:
                 range_llr = self.remainder.without_ghosts(ghosts, range_llr)
         return azimuth_llr, range_llr
+
+    def _most_pointed(self, azimuth_llr: np.ndarray | None) -> float:
+        """The most that azimuth maps can say for any course."""
+        best = self._score_maps(azimuth_llr, None, False, 1, (280.0, SMOOTHING_DEG, 0.5)).azimuth_score
+        return float(np.maximum(best.max(axis=1), 0.0).sum())
 
     def find(
         self,
