@@ -39,9 +39,12 @@ class Ghosts:
     def __init__(self, table: xr.Dataset, pairs: tuple[str, ...]) -> None:
         self._range = table["range"].values
         delay = dict(zip(table["path"].values.tolist(), table["delay"].values, strict=True))
-        heard = [parse_pair(pair) for pair in pairs]
         self._delays = {pair: delay[pair[1]] - delay[pair[0]] for pair in combinations(sorted(delay), 2)}
-        self._heard = [pair for pair in heard if pair in self._delays]
+        self._heard = [
+            pair
+            for pair in map(parse_pair, pairs)
+            if pair in self._delays and np.isfinite(self._delays[pair]).any()
+        ]
         self._slopes = {pair: np.gradient(lag, self._range) for pair, lag in self._delays.items()}
 
     def of(self, range_m: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

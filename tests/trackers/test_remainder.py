@@ -56,6 +56,14 @@ def test_a_ship_that_is_not_there_has_no_ghosts(table):
     assert ranges.shape == rates.shape
 
 
+def test_a_path_that_is_nowhere_makes_no_ghost(table):
+    lost = table.copy(deep=True)
+    lost["delay"][3] = np.nan
+    ranges, _ = Ghosts(lost, PAIRS).of(np.array([5_000.0]), np.array([-6.0]))
+    without = Ghosts(table.isel(path=slice(3)), PAIRS).of(np.array([5_000.0]), np.array([-6.0]))[0]
+    np.testing.assert_allclose(np.sort(ranges[np.isfinite(ranges)]), np.sort(without[np.isfinite(without)]))
+
+
 def test_ghosts_of_what_was_taken_out_are_silent_and_nothing_else(table):
     course = StraightCourse(MINUTES[90], 8000.0, 30.0, 7.0)
     track = Track(MINUTES[0], MINUTES[-1], course, np.diag([1.0, 1.0, 1.0, 1.0]), 100.0)
