@@ -49,7 +49,9 @@ def night(tmp_path_factory, config, write_sds):
     made.inventory.write(str(folder / "station.xml"), format="STATIONXML")
     write_sds(made.stream, folder / "sds")
     station = obsnet.Station.from_stationxml(folder / "station.xml")
-    one = obsnet.track(folder / "sds", station, config)
+    one = obsnet.track(
+        folder / "sds", station, config, folder=folder / "one"
+    )  # packed as an archive's maps are
     report = archive(
         folder / "sds", folder / "station.xml", "2013-05-21", "2013-05-23", folder / "out", config, jobs=2
     )
@@ -99,7 +101,7 @@ def test_a_ship_at_midnight_is_one_track(night):
     assert row["track"].startswith("XX.SIM01-20130522T00") and str(row["date"]) == "2013-05-21"
     for name in ("cpa_distance_m", "course_deg", "speed_mps"):
         assert row[name] == pytest.approx(expected[name], rel=1e-3)
-    # Drawn from the posterior of maps that agree to one step of their packing.
+    # Both are of maps packed to 0.05 nats, on which the spread depends more than on how the days are cut.
     assert row["cpa_time_std_s"] == pytest.approx(expected["cpa_time_std_s"], rel=0.02)
 
 
