@@ -9,6 +9,7 @@ The range at the closest point of approach (CPA) is signed: where it is positive
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,19 @@ class BentCourse(StraightCourse):
         sideways, forwards = sideways + sine * (beyond != 0), forwards + (cosine - 1.0) * (beyond != 0)
         v = self.speed_mps
         return self.cpa_range_m + v * side, v * ahead, v * sideways, v * forwards
+
+
+def emission(
+    motion: StraightCourse, heard: np.ndarray, delay: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Times [s since 1970] at which a ship made what is heard at `heard`: e + delay(range(e)) = t.
+
+    Ships are so slow beside sound that four rounds settle it to 1 ms.
+    """
+    emitted = heard
+    for _ in range(4):
+        emitted = heard - np.asarray(delay(motion.observables(emitted)[1]), float)
+    return emitted
 
 
 def departure(elapsed: np.ndarray, reach: np.ndarray, term: int = 0) -> tuple[np.ndarray, np.ndarray]:

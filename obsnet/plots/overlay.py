@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from obsnet.kinematics import emission
 from obsnet.layout import to_posix
 from obsnet.ocean.rays import travel_time
 from obsnet.plots import style
@@ -57,10 +58,7 @@ def heard(track: Track, delay: Callable, step_s: float = 60.0) -> Curve:
     """
     count = int(np.clip((track.end - track.start) / step_s, 2, 400))
     time = np.linspace(track.start, track.end, count)
-    emitted = time
-    for _ in range(6):
-        emitted = time - np.asarray(delay(track.motion.observables(emitted)[1]), float)
-    azimuth, distance, rate = track.motion.observables(emitted)
+    azimuth, distance, rate = track.motion.observables(emission(track.motion, time, delay))
     if not np.isfinite(track.std[2]):
         azimuth = np.full_like(azimuth, np.nan)
     slowness = (np.asarray(delay(distance + 50.0)) - np.asarray(delay(distance - 50.0))) / 100.0

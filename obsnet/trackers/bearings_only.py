@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from obsnet.errors import ConfigError, LayoutError
-from obsnet.kinematics import StraightCourse, wrap180
+from obsnet.kinematics import StraightCourse, emission, wrap180
 from obsnet.trackers.bearing_bounds import cpa_jacobian, cramer_rao, whitener
 from obsnet.trackers.bearing_errors import BearingErrors
 from obsnet.trackers.bearing_fit import Fit, centre, refine, start_grid, to_theta, turn
@@ -181,7 +182,7 @@ def _locate(
         speed = np.array([speed_mps])
         motion = Fit(to_theta(polar, half, speed), speed, reference, np.zeros(1), np.ones(1, bool)).course()
         if delay is not None:
-            emitted = _emission(record.time, motion, delay)
+            emitted = emission(motion, record.time, partial(_travel_time, delay))
     return motion, emitted, used, log_ratio
 
 
@@ -297,14 +298,6 @@ def _travel_time(delay: Delay, distance: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         seconds = np.asarray(delay(distance), float)
     return np.where(np.isfinite(seconds), seconds, distance / 1500.0)
-
-
-def _emission(heard: np.ndarray, motion: StraightCourse, delay: Delay) -> np.ndarray:
-    """Times at which the ship made what was heard; ships are so slow that four rounds settle it to 1 ms."""
-    emitted = heard
-    for _ in range(4):
-        emitted = heard - _travel_time(delay, motion.observables(emitted)[1])
-    return emitted
 
 
 def _undo_delay(covariance: np.ndarray, motion: StraightCourse, delay: Delay) -> np.ndarray:

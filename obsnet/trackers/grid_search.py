@@ -31,7 +31,7 @@ from obsnet.trackers.line_doppler import Lines, told
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.remainder import Ghosts, Remainder
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
-from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING_DEG, GridSearchConfig, Level
+from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 
@@ -176,7 +176,7 @@ class _Finder:
 
     def _most_pointed(self, azimuth_llr: np.ndarray | None) -> float:
         """The most that azimuth maps can say for any course."""
-        best = self._score_maps(azimuth_llr, None, False, 1, (280.0, SMOOTHING_DEG, 0.5)).azimuth_score
+        best = self._score_maps(azimuth_llr, None, False, 1, SMOOTHING).azimuth_score
         return float(np.maximum(best.max(axis=1), 0.0).sum())
 
     def find(
@@ -194,7 +194,7 @@ class _Finder:
         starts = self._coarse(coarse, (least + self._runs) / self.config.exponent)
         if not starts:
             return None
-        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=(280.0, SMOOTHING_DEG, 0.5))
+        fine = self._score_maps(azimuth_llr, range_llr, jointly, pool=1, stds=SMOOTHING)
         best, point = 0.0, None
         for start in starts:
             best, point = self._level(start, MEDIUM, fine, best, point)

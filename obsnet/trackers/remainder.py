@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
 import xarray as xr
 
-from obsnet.kinematics import wrap180
+from obsnet.kinematics import emission, wrap180
 from obsnet.ocean.rays import parse_pair
 from obsnet.trackers.course_grid import Delay
 from obsnet.trackers.score_maps import above_floor, lobe
@@ -78,17 +77,6 @@ class Ghosts:
         return ranges, rates
 
 
-def as_heard(
-    track: Track, tiles: np.ndarray, delay: Callable[[np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Azimuth [deg], range [m] and range rate [m/s] of a track when what is heard at `tiles` (s since 1970) left it."""
-    emitted = tiles
-    for _ in range(3):
-        _, distance, _ = track.motion.observables(emitted)
-        emitted = tiles - delay(distance)
-    return track.motion.observables(emitted)
-
-
 class Remainder:
     """Maps of one segment's tiles without what is known, which it remembers.
 
@@ -120,7 +108,7 @@ class Remainder:
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The maps with what a track explains made silent, for the search of the next ship; beyond `reach_m` it explains nothing."""
         self._taken.append((track, reach_m))
-        azimuth, distance, rate = as_heard(track, self._tiles, self._delay)
+        azimuth, distance, rate = track.motion.observables(emission(track.motion, self._tiles, self._delay))
         distance = np.where(distance <= reach_m, distance, np.nan)
         ranged = np.zeros(len(self._tiles), bool)
         if range_llr is not None:
@@ -147,7 +135,7 @@ class Remainder:
         """Range maps in which the ghosts of all that was taken out are silent too."""
         range_llr = range_llr.copy()
         for track, reach_m in self._taken:
-            _, distance, rate = as_heard(track, self._tiles, self._delay)
+            _, distance, rate = track.motion.observables(emission(track.motion, self._tiles, self._delay))
             ranges, rates = ghosts.of(np.where(distance <= reach_m, distance, np.nan), rate)
             first, last, slowest, fastest = (
                 np.searchsorted(axis, at + side * reach)

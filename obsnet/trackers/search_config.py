@@ -74,5 +74,5 @@ class Level:
 MEDIUM = Level((20.0, 200.0, 2.0, 0.1), (180.0, 1000.0, 10.0, 0.5))
 FINE = Level((4.0, 40.0, 0.4, 0.02), (20.0, 200.0, 2.0, 0.1))
 
-SMOOTHING_DEG = 3.0
-"""Standard deviation by which azimuth maps are smoothed for these levels."""
+SMOOTHING = (280.0, 3.0, 0.5)
+"""Standard deviations by which maps are smoothed for these levels: range [m], azimuth [deg], range rate [m/s]."""

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import xarray as xr
 
-from obsnet.trackers.remainder import as_heard
+from obsnet.kinematics import emission
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, tiles
-from obsnet.trackers.search_config import SMOOTHING_DEG, GridSearchConfig
+from obsnet.trackers.search_config import SMOOTHING, GridSearchConfig
 from obsnet.trackers.track import Segment, Track
 
 
@@ -49,8 +49,8 @@ def outdoes_steady_sources(
     azimuth = maps["azimuth"].values
     step = float(azimuth[1] - azimuth[0])
     scores = azimuth_scores(
-        azimuth_llr, SMOOTHING_DEG / step, config.tile_bound, config.azimuth_detection_probability
+        azimuth_llr, SMOOTHING[1] / step, config.tile_bound, config.azimuth_detection_probability
     )
-    towards, _, _ = as_heard(track, times, delay)
+    towards, _, _ = track.motion.observables(emission(track.motion, times, delay))
     place = np.round((towards - azimuth[0]) / step).astype(int) % len(azimuth)
     return float(scores[np.arange(len(times)), place].sum()) > two_steady(scores)

@@ -49,9 +49,8 @@ def night(tmp_path_factory, config, write_sds):
     made.inventory.write(str(folder / "station.xml"), format="STATIONXML")
     write_sds(made.stream, folder / "sds")
     station = obsnet.Station.from_stationxml(folder / "station.xml")
-    one = obsnet.track(
-        folder / "sds", station, config, folder=folder / "one"
-    )  # packed as an archive's maps are
+    # Into a folder: its maps are packed as the archive's are.
+    one = obsnet.track(folder / "sds", station, config, folder=folder / "one")
     report = archive(
         folder / "sds", folder / "station.xml", "2013-05-21", "2013-05-23", folder / "out", config, jobs=2
     )
