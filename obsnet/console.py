@@ -58,6 +58,26 @@ def _stop(number: int, frame: object = None) -> NoReturn:
 
 
 @contextmanager
+def patiently() -> Iterator[None]:
+    """Have an interruption or a request to terminate wait until the body is done: raised within a library's callback it crashes the process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if handler is not None}
+    for number in handlers:
+        signal.signal(number, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])
+
+
+@contextmanager
 def caching() -> Iterator[None]:
     """A place for the caches of numba and matplotlib where neither package nor home can be written.
 

@@ -18,6 +18,7 @@ from xarray.core.indexing import (
     explicit_indexing_adapter,
 )
 
+from obsnet.console import patiently
 from obsnet.errors import OutputError
 from obsnet.layout import from_posix, to_posix
 
@@ -46,6 +47,7 @@ class TimeWriter:
         self._file: Any = None
         self._bytes: _PatientFile | None = None
 
+    @patiently()
     def append(self, block: xr.Dataset) -> None:
         """Write the next block; the first one sets variables, coordinates and dims."""
         if not block.sizes.get("time", 0):
@@ -68,6 +70,7 @@ class TimeWriter:
         variable.resize(first + len(rows), axis=0)
         variable[first:] = rows
 
+    @patiently()
     def close(self) -> None:
         """Finish the file and move it to its name."""
         if self._file is None:
@@ -85,6 +88,7 @@ class TimeWriter:
     def __enter__(self) -> TimeWriter:
         return self
 
+    @patiently()
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:

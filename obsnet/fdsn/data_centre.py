@@ -14,6 +14,7 @@ from obspy.clients.fdsn import Client
 from obspy.clients.fdsn import header as fdsn_errors
 
 import obsnet
+from obsnet.console import patiently
 from obsnet.errors import ConfigError, SourceError
 from obsnet.fdsn.sds import Day
 
@@ -107,7 +108,8 @@ class DataCentre:
             return b"".join(self.waveforms(half) for half in halves)
         if content:
             try:
-                obspy.read(BytesIO(content), format="MSEED", headonly=True)
+                with patiently():
+                    obspy.read(BytesIO(content), format="MSEED", headonly=True)
             except Exception as error:  # obspy raises bare Exception subclasses of many kinds here
                 raise SourceError(
                     f"{self.url} answers for {day.name} with no miniSEED: {_line(error)}"

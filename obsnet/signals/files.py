@@ -20,6 +20,7 @@ from obspy.core.util.base import ENTRY_POINTS
 from obspy.core.util.decorator import uncompress_file
 from obspy.core.util.misc import buffered_load_entry_point
 
+from obsnet.console import patiently
 from obsnet.errors import WaveformError
 from obsnet.signals.station import Station
 from obsnet.signals.timeline import Piece
@@ -163,7 +164,8 @@ def _read_plain(path: str, headonly: bool) -> Any:
             continue
         recognises = buffered_load_entry_point(entry.dist.name, f"obspy.plugin.waveform.{name}", "isFormat")
         if recognises(path):
-            return obspy.read(path, format=name, headonly=headonly, check_compression=False)
+            with patiently():
+                return obspy.read(path, format=name, headonly=headonly, check_compression=False)
     raise WaveformError("no format that obspy reads")
 
 

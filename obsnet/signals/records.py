@@ -21,6 +21,7 @@ import numpy as np
 import obspy
 from obspy.io.mseed import InternalMSEEDWarning
 
+from obsnet.console import patiently
 from obsnet.errors import WaveformError
 from obsnet.signals.timeline import JOIN_SAMPLES, Piece
 
@@ -114,7 +115,8 @@ class RecordReader:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", InternalMSEEDWarning)
-                parts = [trace.data for trace in obspy.read(io.BytesIO(raw), format="MSEED")]
+                with patiently():
+                    parts = [trace.data for trace in obspy.read(io.BytesIO(raw), format="MSEED")]
             if sum(part.size for part in parts) == expected:
                 return parts[0] if len(parts) == 1 else np.concatenate(parts)
         except (

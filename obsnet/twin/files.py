@@ -14,6 +14,7 @@ import pandas as pd
 from obspy import Stream
 from obspy.core.inventory import Inventory
 
+from obsnet.console import patiently
 from obsnet.errors import OutputError
 from obsnet.layout import iso
 from obsnet.twin.scenario import Scenario
@@ -29,6 +30,7 @@ WAVEFORMS, METADATA, AIS, MINUTES, PASSAGES = (
 STAMP = "%Y-%m-%dT%H:%M:%S.%fZ"
 
 
+@patiently()
 def append_stream(file: BinaryIO, stream: Stream) -> None:
     """Append every trace to an open miniSEED file."""
     for trace in stream:
