@@ -44,10 +44,10 @@ LOOSEST = (3600.0, 15_000.0)
 LOOSEST_NEXT = (900.0, 3000.0)
 """The same of a further ship: what is left of a known one is a piece of course that fits many."""
 
-SHARP = (60.0, 500.0)
-"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as a ship that passes overhead."""
+SHARP = (120.0, 500.0)
+"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as what is left of a known ship is not."""
 
-BRIEF = 2.0 / 3.0
+BRIEF = 0.5
 """Share of `shortest_s` for which such a ship must be heard, if it moves beyond the doubt that is allowed a ship apart."""
 
 APART = 0.1
@@ -158,16 +158,18 @@ class _Finder:
         for number in range(config.max_ships - len(tracks) if self.sees_course else 1):
             others = [*tracks, *known]
             least = config.min_log_bayes_factor
-            if others:
-                least = min(config.min_log_bayes_factor_next, config.min_log_bayes_factor_apart)
             if ghosts is not None and self._most_pointed(azimuth_llr) < POINTED:
                 break
             jointly = bool(number or known) and self.sees_course and ghosts is None
             found = self.find(azimuth_llr, range_llr, least, jointly)
+            mixed = not jointly and ghosts is None and found is not None and not _is_one(found)
+            if mixed:
+                found = self.find(azimuth_llr, range_llr, least, True)
             if found is None or found.log_bayes_factor < self.required(found, others):
                 break
             pointed = ghosts is None or (found.extra["pointed"] >= POINTED and _is_sharp(found))
-            if pointed and self.believable(found) and (not others or _is_no_remainder(found)):
+            one_of_many = bool(others) or mixed
+            if pointed and self.believable(found) and (not one_of_many or _is_no_remainder(found)):
                 tracks.append(found)
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
             if ghosts is not None and range_llr is not None:
@@ -424,13 +426,12 @@ class _Finder:
         located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
         moves = moving >= config.min_log_bayes_factor
         moves &= track.extra.get("score", 0.0) > track.extra.get("steady", -np.inf)
-        one = track.extra.get("agreeing", 1.0) >= AGREEING
-        return bool(long_enough and within_speed and within_range and located and moves and one)
+        return bool(long_enough and within_speed and within_range and located and moves and _is_one(track))
 
     def required(self, track: Track, others: Sequence[Track]) -> float:
         """The log Bayes factor that a track must reach beside what else is known."""
         config = self.config
-        if not others:
+        if not others or _is_sharp(track):
             return config.min_log_bayes_factor
         shared = sum(min(track.end, other.end) - max(track.start, other.start) for other in others
                      if other.start < track.end and other.end > track.start)  # fmt: skip
@@ -482,6 +483,11 @@ class _Finder:
 def _is_sharp(track: Track) -> bool:
     """Whether a track's CPA is located sharply."""
     return bool(track.std[0] < SHARP[0] and track.std[1] < SHARP[1])
+
+
+def _is_one(track: Track) -> bool:
+    """Whether a track's range and azimuth are heard in the same tiles, as one ship's are."""
+    return bool(track.extra.get("agreeing", 1.0) >= AGREEING)
 
 
 def _is_no_remainder(track: Track) -> bool:

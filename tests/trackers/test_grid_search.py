@@ -162,16 +162,18 @@ def test_what_is_located_nowhere_may_be_a_first_ship_but_no_further_one(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("begins", "evidence", "count"),
-    [(130, 40.0, 2), (130, 20.0, 1), (90, 40.0, 1), (90, 80.0, 2)],
-)
-def test_a_further_ship_heard_when_no_other_is_needs_less_evidence(monkeypatch, begins, evidence, count):
-    """The first ship's remainder can only be heard while that ship is; beyond its time less may be believed."""
+    ("begins", "spread", "evidence", "count"),
+    [(130, 900.0, 40.0, 2), (130, 900.0, 20.0, 1), (90, 900.0, 40.0, 1), (90, 900.0, 80.0, 2), (90, 200.0, 12.0, 2), (90, 200.0, 8.0, 1)],
+)  # fmt: skip
+def test_a_further_ship_apart_from_others_or_located_sharply_needs_less_evidence(
+    monkeypatch, begins, spread, evidence, count
+):
+    """The first ship's remainder can only be heard while that ship is, and fits many courses: where that can not be, less is believed."""
 
     def ship(cpa_range, first, last, evidence):
         course = StraightCourse(T0 + 7000.0, cpa_range, 60.0, 8.0)
         extra = {"heard": 0.9, "log_bayes_factor_fixed": 200.0}
-        covariance = np.diag([30.0, 200.0, 5.0, 0.5]) ** 2
+        covariance = np.diag([30.0, spread, 5.0, 0.5]) ** 2
         return Track(MINUTES[first], MINUTES[last], course, covariance, evidence, extra=extra)
 
     found = iter([ship(10_000.0, 0, 130, 300.0), ship(-15_000.0, begins, 239, evidence), None])
@@ -182,11 +184,11 @@ def test_a_further_ship_heard_when_no_other_is_needs_less_evidence(monkeypatch, 
 
 @pytest.mark.parametrize(
     ("minutes", "std", "moving", "count"),
-    [(20, (10.0, 150.0), 60.0, 1), (20, (100.0, 150.0), 60.0, 0), (20, (10.0, 900.0), 60.0, 0),
-     (20, (10.0, 150.0), 20.0, 0), (14, (10.0, 150.0), 60.0, 0), (30, (100.0, 900.0), 20.0, 1)],
+    [(14, (10.0, 150.0), 60.0, 1), (20, (200.0, 150.0), 60.0, 0), (20, (10.0, 900.0), 60.0, 0),
+     (20, (10.0, 150.0), 20.0, 0), (10, (10.0, 150.0), 60.0, 0), (30, (200.0, 900.0), 20.0, 1)],
 )  # fmt: skip
 def test_a_brief_ship_must_be_located_sharply_and_move(monkeypatch, minutes, std, moving, count):
-    """A fast ship that passes overhead is heard for twenty minutes, and where it was is then known well."""
+    """A fast ship that passes overhead, or beside a louder one, is heard for a quarter of an hour, and where it was is then known well."""
     course = StraightCourse(T0 + 7000.0, 800.0, 60.0, 12.0)
     extra = {"heard": 0.9, "log_bayes_factor_fixed": moving}
     covariance = np.diag([*std, 5.0, 0.5]) ** 2
@@ -228,6 +230,29 @@ def test_neither_two_ships_in_one_course_nor_steady_sources_are_a_track(monkeypa
     found = iter([Track(MINUTES[0], MINUTES[-1], course, covariance, 300.0, extra=said), None])
     monkeypatch.setattr(_Finder, "find", lambda self, *maps: next(found))
     assert len(search(maps_of([], MINUTES, np.random.default_rng(1)), SEGMENT, delay)) == count
+
+
+def test_one_ships_range_on_anothers_azimuth_is_looked_for_anew_where_both_are_heard(monkeypatch):
+    """Taken out as it is, such a course would take both ships with it."""
+    given = {"heard": 0.9, "log_bayes_factor_fixed": 200.0}
+
+    def found(self, azimuth, distance, least, jointly):
+        if (taken := azimuth is not whole) and len(asked) > 1:
+            return None
+        asked.append((jointly, taken))
+        course = StraightCourse(T0 + 7000.0, 8000.0 if jointly else 5000.0, 60.0, 8.0)
+        extra = given | {"agreeing": 1.0 if jointly else 0.2}
+        return Track(
+            MINUTES[0], MINUTES[-1], course, np.diag([30.0, 200.0, 5.0, 0.5]) ** 2, 300.0, extra=extra
+        )
+
+    maps = maps_of([], MINUTES, np.random.default_rng(1))
+    finder = _Finder(maps, MINUTES[::3], delay, GridSearchConfig(), 1)
+    whole, asked, tracks = maps["azimuth_llr"].values[::3], [], []
+    monkeypatch.setattr(_Finder, "find", found)
+    finder.one_by_one(tracks, [], whole, maps["range_llr"].values[::3])
+    assert asked == [(False, False), (True, False)]
+    assert [track.motion.cpa_range_m for track in tracks] == [8000.0]
 
 
 def test_lobe_of_a_ship_ends_where_anothers_begins():
