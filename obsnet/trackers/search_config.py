@@ -14,7 +14,8 @@ class GridSearchConfig:
     `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
     and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
     reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
-    when no other is. A track must be heard for `shortest_s`.
+    when no other is; where its CPA is located sharply, to two minutes and 500 m as remainders are not, no more than a first one. A track must be heard for
+    `shortest_s`, for half of it if it is located sharply and moves.
     `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
     to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range). With `lines`, the Doppler shift of a ship's
     lines has a say in the scale of its distance and speed (`obsnet.trackers.line_doppler`).
