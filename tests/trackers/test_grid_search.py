@@ -232,6 +232,25 @@ def test_neither_two_ships_in_one_course_nor_steady_sources_are_a_track(monkeypa
     assert len(search(maps_of([], MINUTES, np.random.default_rng(1)), SEGMENT, delay)) == count
 
 
+def test_a_ship_heard_for_a_third_of_an_hour_beside_a_louder_one_is_found_by_where_it_is():
+    """What is left of a louder ship may say more, but of no one course."""
+    rng = np.random.default_rng(5)
+    loud, brief = (
+        StraightCourse(T0 + 7000.0, 12_000.0, 60.0, 7.0),
+        StraightCourse(MINUTES[150], -8_500.0, 330.0, 13.0),
+    )
+    maps, other = maps_of([loud], MINUTES, rng), maps_of([brief], MINUTES, rng, strength=6.0)
+    there = abs(np.arange(len(MINUTES)) - 150) <= 9
+    for name in ("azimuth_llr", "range_llr"):
+        maps[name][there] = np.maximum(maps[name][there].values, other[name][there].values)
+    first, second = search(maps, SEGMENT, delay)
+    assert abs(first.motion.cpa_time - loud.cpa_time) < 60.0
+    assert second.log_bayes_factor < GridSearchConfig().min_log_bayes_factor_next
+    assert abs(second.motion.cpa_time - brief.cpa_time) < 60.0
+    assert abs(second.motion.cpa_range_m - brief.cpa_range_m) < 500.0
+    assert abs(wrap180(second.motion.course_deg - brief.course_deg)) < 15.0
+
+
 def test_one_ships_range_on_anothers_azimuth_is_looked_for_anew_where_both_are_heard(monkeypatch):
     """Taken out as it is, such a course would take both ships with it."""
     given = {"heard": 0.9, "log_bayes_factor_fixed": 200.0}
