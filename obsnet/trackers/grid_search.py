@@ -54,7 +54,7 @@ APART = 0.1
 """Share of the time that a ship is heard up to which others may be heard in it too for it to be apart from them."""
 
 COARSE_SHARE = 0.6
-"""What the bound of a coarse cell is at least of the best score in it; 0.87 at the least for 46 simulated ships."""
+"""What the bound of a coarse cell is at least of the best score in it."""
 
 POINTED = 4.0
 """What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's, and located sharply."""
@@ -154,10 +154,10 @@ class _Finder:
         With `ghosts`, of which the maps are free, range speaks for a further ship where azimuth does not, too.
         """
         config = self.config
+        least = config.min_log_bayes_factor
         # Without azimuths nothing tells a second ship from the first one's ghost ranges.
         for number in range(config.max_ships - len(tracks) if self.sees_course else 1):
             others = [*tracks, *known]
-            least = config.min_log_bayes_factor
             if ghosts is not None and self._most_pointed(azimuth_llr) < POINTED:
                 break
             jointly = bool(number or known) and self.sees_course and ghosts is None
