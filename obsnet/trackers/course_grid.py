@@ -18,8 +18,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from obsnet.trackers.score_maps import ScoreMaps, polyphase
 
 _CELLS_AT_ONCE, _PLACES_AT_ONCE = 1 << 16, 1 << 14
-_FIRST_BATCH, _LARGEST_BATCH = 512, 8192
+_FIRST_BATCH, _LARGEST_BATCH = 512, 1 << 16
 _TILES_AT_ONCE = 8
+_SECTOR = 6
+"""Courses that are left out or scored together."""
+_MANY = 10_000_000
+"""Cells times tiles scored from which on a compiled kernel is worth its loading."""
 _SCALES, _SCALE_STEP, _APART = 55, 0.02, 0.12
 """Scales looked at to either side, and their step and the least that counts as another, in natural logarithms."""
 NEARLY = 0.75
@@ -82,6 +86,7 @@ class CourseGrid:
         far, side = np.unique(np.abs(cpa_range), return_inverse=True)
         self._far = (side.reshape(-1, 1) * len(speed) + np.arange(len(speed))).reshape(-1)
         starboard = np.repeat(cpa_range < 0, len(speed))
+        self._scored = 0
         layout, step = self._read(scores)
         self._place(offset, far, speed, starboard, delay, scores, step, float(course[0]), layout)
 
@@ -94,7 +99,9 @@ class CourseGrid:
     def _read(self, scores: ScoreMaps) -> tuple[tuple[int, ...], float]:
         """Take score maps; returns how azimuth rows are laid out (phases, length) and their step, deg."""
         rows, step = polyphase(scores.azimuth_score, scores.azimuth_step, self._course_step, self._courses)
-        self._pointing = sliding_window_view(rows.reshape(len(rows), -1), self._courses, axis=1)
+        self._rows = rows.reshape(len(rows), -1)
+        self._pointing = sliding_window_view(self._rows, self._courses, axis=1)
+        self._sectors: np.ndarray | None = None
         self._range_score, self._best_corner = scores.flat, scores.best_corner
         self._rates, self._jointly = scores.range_score.shape[2], scores.jointly
         return rows.shape[1:], step
@@ -166,15 +173,77 @@ class CourseGrid:
 
     def scores(self, cells: np.ndarray) -> np.ndarray:
         """Scores of all courses of chosen cells (flat indices), (n, n_course) float32."""
+        return self._scores(cells, self._rows, self._courses)
+
+    def scores_above(self, cells: np.ndarray, least: float, threads: int = 1) -> np.ndarray:
+        """`scores` of the courses that may exceed `least`; minus infinity for the others.
+
+        Courses are left out a sector at a time: every tile counts with the best azimuth of the sector.
+        """
+        count, rest = divmod(self._courses, _SECTOR)
+        if rest or count < 2:
+            return self.scores(cells)
+        if self._sectors is None:
+            ahead = sliding_window_view(self._rows, _SECTOR, axis=1).max(axis=2)
+            laid = sliding_window_view(ahead, self._courses - _SECTOR + 1, axis=1)[:, :, ::_SECTOR]
+            self._sectors = np.ascontiguousarray(laid).reshape(len(laid), -1)
+        bounds = self._scores(cells, self._sectors, count, count, threads=threads)
+        cell, sector = np.nonzero(bounds > least)
+        found = np.full((len(cells), count, _SECTOR), -np.inf, np.float32)
+        first = _SECTOR * sector
+        found[cell, sector] = self._scores(cells[cell], self._rows, _SECTOR, 1, first, threads)
+        return found.reshape(len(cells), -1)
+
+    def _scores(
+        self,
+        cells: np.ndarray,
+        rows: np.ndarray,
+        count: int,
+        pace: int = 1,
+        first: np.ndarray | int = 0,
+        threads: int = 1,
+    ) -> np.ndarray:
+        """Greatest runs (n_cells, count) float32, azimuths read from place `pace` · row + `first` of `rows` (n_tiles, n_place) on."""
         time, where = np.divmod(cells, len(self._far))
-        run, best = np.zeros((2, len(cells), self._pointing.shape[2]), np.float32)
+        first = np.broadcast_to(first, cells.shape)
+        best = np.zeros((len(cells), count), np.float32)
+        self._scored += len(cells)
+        if self._scored * len(rows) > _MANY:
+            self._compiled(time, where, first, rows, pace, best, threads)
+            return best
+        run, pointing = np.zeros_like(best), sliding_window_view(rows, count, axis=1)
         for m, score in enumerate(self._range_score):
             offset = self._index[time, m]
             at = offset * self._cell.shape[1] + self._far[where]
             share = _between(score, self._cell.take(at), self._rates, self._right.take(at), self._up.take(at))
-            row = self._row.take(offset * len(self._far) + where)
-            _lengthen(run, best, self._pointing[m][row], share[:, None], self._jointly)
+            row = pace * self._row.take(offset * len(self._far) + where) + first
+            _lengthen(run, best, pointing[m][row], share[:, None], self._jointly)
         return best
+
+    def _compiled(
+        self,
+        time: np.ndarray,
+        where: np.ndarray,
+        first: np.ndarray,
+        rows: np.ndarray,
+        pace: int,
+        best: np.ndarray,
+        threads: int,
+    ) -> None:
+        """The same by a kernel, whose compiler takes as long to load as an ordinary search."""
+        from obsnet.trackers.course_kernels import greatest_runs
+
+        places = (self._index, self._far, self._cell, self._right, self._up, self._row)
+
+        def fill(part: slice) -> None:
+            greatest_runs(
+                time[part], where[part], first[part], *places, self._range_score, self._rates, rows, pace,
+                self._jointly, best[part],
+            )  # fmt: skip
+
+        step = max(-(-len(time) // threads), 1)
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(fill, (slice(lo, lo + step) for lo in range(0, len(time), step))))
 
 
 def _lengthen(
@@ -204,7 +273,7 @@ def best_first(bounds: np.ndarray) -> Iterator[np.ndarray]:
     order = np.argsort(-bounds, axis=None)
     first, size = 0, _FIRST_BATCH
     while first < len(order):
-        yield order[first : first + size]
+        yield np.sort(order[first : first + size])  # neighbours are read together
         first, size = first + size, min(2 * size, _LARGEST_BATCH)
 
 

@@ -261,7 +261,7 @@ class _Finder:
             cells = cells[bounds.flat[cells] > least]
             if not cells.size:
                 break
-            scored = grid.scores(cells)
+            scored = grid.scores_above(cells, least, self.threads)
             values.flat[cells], headings.flat[cells] = scored.max(axis=1), scored.argmax(axis=1)
             found = apart(values, config.candidates)
         return [

@@ -1,8 +1,12 @@
 """A grid's bounds hold, its scores are those of single courses, and the best come first."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
+from obsnet.trackers import course_grid
 from obsnet.trackers.course_grid import CourseGrid, Delay, best_first, score_points
 from obsnet.trackers.score_maps import ScoreMaps
 
@@ -70,8 +74,28 @@ def test_single_courses_score_as_the_grid_does(jointly):
         assert best_run(shares) == pytest.approx(score)
 
 
+@pytest.mark.parametrize("jointly", [False, True])
+@pytest.mark.parametrize("many", [np.inf, 0])
+def test_no_course_above_a_score_is_left_out(monkeypatch, jointly, many):
+    """By arrays, and by the kernel of very many courses."""
+    monkeypatch.setattr(course_grid, "_MANY", np.inf)
+    heard = maps(jointly)
+    quiet = replace(heard, azimuth_score=heard.azimuth_score - 1.5)
+    grid = CourseGrid(CPA_TIME, CPA_RANGE, SPEED, COURSE, TILES, DELAY, quiet)
+    cells = np.random.default_rng(7).permutation(np.prod(grid.shape))
+    expected = grid.scores(cells)
+    monkeypatch.setattr(course_grid, "_MANY", many)
+    least = float(np.quantile(expected, 0.9))
+    found = grid.scores_above(cells, least, threads=2)
+    assert np.array_equal(found[expected > least], expected[expected > least])
+    left_out = found == -np.inf
+    assert left_out.mean() > 0.2 and (expected[left_out] <= least).all()
+    assert np.array_equal(grid.scores_above(cells, -np.inf), expected)
+
+
 def test_every_cell_comes_once_the_greatest_bounds_first():
     bounds = np.random.default_rng(6).standard_normal((30, 40, 3)).astype(np.float32)
-    order = np.concatenate(list(best_first(bounds)))
-    assert (np.diff(bounds.flat[order]) <= 0).all()
-    assert (np.sort(order) == np.arange(bounds.size)).all()
+    batches = list(best_first(bounds))
+    for batch, following in pairwise(batches):
+        assert bounds.flat[batch].min() >= bounds.flat[following].max()
+    assert (np.sort(np.concatenate(batches)) == np.arange(bounds.size)).all()
