@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
 import numpy as np
@@ -24,13 +24,13 @@ from obsnet.detectors.analytic import (
     RangeDetectorConfig,
 )
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
-from obsnet.detectors.background import BackgroundDirection
+from obsnet.detectors.azimuths import Azimuths, horizontals, unheard
 from obsnet.detectors.lines import line_level, line_power
 from obsnet.detectors.maps import (
     MARGINAL,
     LikelihoodMaps,
-    coverage,
     detections,
+    filled_up,
     joined,
     presence,
     window_bounds,
@@ -40,9 +40,9 @@ from obsnet.layout import from_posix, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table
 from obsnet.ocean.sound_speed import OceanConfig
-from obsnet.signals.azigram import AzigramConfig, azigram
+from obsnet.signals.azigram import AzigramConfig
 from obsnet.signals.cepstrogram import CepstrogramConfig, ClutterFilter, cepstrogram
-from obsnet.signals.held import followed_by, laid_out, per_minute, taken_up, thinned_power
+from obsnet.signals.held import followed_by, laid_out, per_minute, taken_up, thinned_power, under
 from obsnet.signals.spectra import SpectraConfig
 from obsnet.signals.station import Station
 from obsnet.trackers.search_config import GridSearchConfig
@@ -56,6 +56,9 @@ if TYPE_CHECKING:
 _HORIZONTALS = {"east", "north"}
 
 NEEDS_FULL_AZIMUTHS = "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
+
+_AXES = "polarisation"
+"""Name in a state of what azimuths by polarisation depend on."""
 
 _MARGINAL = {
     "long_name": "log-likelihood ratio against no ship, range rate marginalised over an even prior",
@@ -165,18 +168,10 @@ class Pipeline:
         self.table = table if table is not None else propagation_table(config.ocean, station.depth_m)
         expected = amplitudes or Amplitudes.broad().scaled_to(station.depth_m)
         self._azimuth = AnalyticAzimuthDetector(config.azimuth)
-        self._learned = (
-            _learned_azimuth(config) if config.detector in ("learned", "learned-azimuth") else None
-        )
         self._range = _range_detector(config, self.table, expected)
         self._clutter = ClutterFilter(config.cepstrogram)
-        self._background = BackgroundDirection(
-            config.azimuth.background_window_s,
-            config.azimuth.background_step_s,
-            config.azimuth.background_prior_s,
-        )
-        self._azigram: xr.DataArray | None = None
-        self._null: np.ndarray | None = None
+        self._azimuths = self._by(config.azigram)
+        self._axes: Azimuths | None = None
         self._cepstrogram: xr.DataArray | None = None
         self._spectrogram: xr.DataArray | None = None
         self._lines: xr.DataArray | None = None
@@ -196,10 +191,10 @@ class Pipeline:
         finished: list[Minutes] = []
         if self._last is not None and times[0] - self._last > LONG_SILENCE_S:
             finished += self.flush()
-            self._azigram = self._null = self._cepstrogram = self._spectrogram = self._lines = None
+            self._cepstrogram = self._spectrogram = self._lines = None
             self._next = None
-            if self._learned is not None:
-                self._learned.reset()
+            for azimuths in self._by_each():
+                azimuths.restart()
         if self.config.tracker == "bernoulli" and not set(spectra) >= {*_HORIZONTALS, "p"}:
             raise ConfigError(NEEDS_FULL_AZIMUTHS)
         if self._next is None:
@@ -207,7 +202,8 @@ class Pipeline:
             self._next = float(np.ceil(first / self.config.azimuth.step_s) * self.config.azimuth.step_s)
         self._last = float(times[-1])
         ready = times[-1] - self.config.azimuth.window_s / 2
-        looks = self._learned is not None and (self._azigram is not None or set(spectra) >= _HORIZONTALS)
+        learned = self._azimuths.learned is not None
+        looks = learned and (self._azimuths.azigram is not None or set(spectra) >= _HORIZONTALS)
         self._begin(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s, spectra)
         return finished + self._done(self._most)
 
@@ -215,8 +211,8 @@ class Pipeline:
         """Finish all minutes of a record, with the last ones, whose windows reach beyond its end."""
         held = self._spectrogram
         if held is not None and held.sizes["time"]:
-            if self._learned is not None:
-                self._learned.finish()
+            for azimuths in self._by_each():
+                azimuths.finish()
             self._begin(float(to_posix(held["time"].values[-1])))
         return self._done(0)
 
@@ -246,7 +242,10 @@ class Pipeline:
     @property
     def models(self) -> dict[str, str]:
         """SHA-256 of the learned models in use, by task."""
-        files = {"azimuth": getattr(self._learned, "file", None), "range": getattr(self._range, "file", None)}
+        files = {
+            "azimuth": getattr(self._azimuths.learned, "file", None),
+            "range": getattr(self._range, "file", None),
+        }
         return {task: file.digest for task, file in files.items() if file is not None}
 
     @property
@@ -269,13 +268,13 @@ class Pipeline:
                 "the focalization tracker cannot be stopped and continued; use --tracker grid for a live station"
             )
         arrays = {"next": np.array(self._next, float), "last": np.array(self._last, float)}
-        for name, stage in self._stages().items():
-            arrays |= {f"{name}/{key}": value for key, value in stage.state().items()}
+        arrays |= self._azimuths.state()
+        for name, stage in {"clutter": self._clutter, _AXES: self._axes}.items():
+            if stage is not None:
+                arrays |= {f"{name}/{key}": value for key, value in stage.state().items()}
         for name, held in self._held().items():
             if held is not None:
                 arrays |= {f"{name}/{key}": value for key, value in laid_out(held).items()}
-        if self._null is not None:
-            arrays["null"] = self._null
         return arrays
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -283,21 +282,17 @@ class Pipeline:
         self._next, self._last = (
             None if np.isnan(state[name]) else float(state[name]) for name in ("next", "last")
         )
-        for name, stage in self._stages().items():
-            stage.restore(_under(state, name))
-        self._azigram, self._cepstrogram, self._spectrogram, self._lines = (
-            taken_up(_under(state, name)) for name in self._held()
+        self._clutter.restore(under(state, "clutter"))
+        self._azimuths.restore(state)
+        if axes := under(state, _AXES):
+            self._axes = self._by_polarisation()
+            self._axes.restore(axes)
+        self._cepstrogram, self._spectrogram, self._lines = (
+            taken_up(under(state, name)) for name in self._held()
         )
-        self._null = state.get("null")
-
-    def _stages(self) -> dict[str, Any]:
-        """The stages that remember something between blocks."""
-        stages = {"clutter": self._clutter, "background": self._background}
-        return stages if self._learned is None else stages | {"learned": self._learned}
 
     def _held(self) -> dict[str, xr.DataArray | None]:
         return {
-            "azigram": self._azigram,
             "cepstrogram": self._cepstrogram,
             "spectrogram": self._spectrogram,
             "lines": self._lines,
@@ -311,7 +306,8 @@ class Pipeline:
         if spectra is not None:
             self._spectrogram = followed_by(self._spectrogram, thinned_power(spectra))
             self._lines = followed_by(self._lines, line_power(spectra))
-        ranges, azimuths = self._range_maps(minutes, spectra), self._azimuth_maps(minutes, spectra)
+        ranges = self._range_maps(minutes, spectra)
+        azimuths, axes = self._azimuth_maps(minutes, spectra)
         if not len(minutes):
             return
         if not azimuths and not ranges:
@@ -320,7 +316,7 @@ class Pipeline:
             )
         assert self._lines is not None
         lines = line_level(self._lines, minutes, self.config.azimuth.window_s)
-        self._coming.append(_Coming(minutes, [azimuths, ranges], lines, self._features(minutes)))
+        self._coming.append(_Coming(minutes, [azimuths, axes, ranges], lines, self._features(minutes)))
         self._next = float(minutes[-1] + step)
         self._forget(self._next - self.config.azimuth.window_s / 2)
 
@@ -336,7 +332,12 @@ class Pipeline:
         return done
 
     def _finished(self, coming: _Coming) -> Minutes:
-        parts = [joined([Crew.result_of(part) for part in maps]) for maps in coming.maps if maps]
+        azimuths, axes, ranges = (
+            joined([Crew.result_of(part) for part in maps]) if maps else None for maps in coming.maps
+        )
+        if azimuths is not None and axes is not None:
+            azimuths = filled_up(azimuths, axes)
+        parts = [part for part in (azimuths, ranges) if part is not None]
         maps = xr.merge(parts, combine_attrs="drop_conflicts", join="exact", compat="equals")
         maps["line_level"] = coming.lines
         maps.attrs.update({"station": self.station.code, "detector": self.config.detector})
@@ -382,28 +383,37 @@ class Pipeline:
             ordered.append(self._crew.submit(sensor, held[:, frames], minutes[part], *more))
         return ordered
 
-    def _azimuth_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[Future]:
-        """Take what the next spectra say of azimuth, and begin some minutes; none without horizontals."""
-        if spectra is not None and set(spectra) >= _HORIZONTALS:
-            azimuths = azigram(spectra, self.config.azigram)
-            directional = self._learned is None and self.config.azimuth.null == "directional"
-            null = self._background(azimuths) if directional else None
-            if self._learned is not None:
-                self._learned.take(spectra)
-            self._null = null if self._null is None else _join(self._null, null)
-            self._azigram = followed_by(self._azigram, azimuths)
-        held = self._azigram
-        if held is None or not len(minutes):
-            return []
-        if self._learned is None:
-            return self._ordered("azimuth", held, minutes, self._null)
-        window_s, times = self.config.azimuth.window_s, to_posix(held["time"].values)
-        bounds = window_bounds(times, minutes, window_s)
-        heard = ~np.isnan(held.values).all(axis=0)
-        covered = coverage(heard, *bounds, minutes, window_s, self.config.spectra.hop_s)
-        made: Future = Future()
-        made.set_result(self._learned.maps(minutes, covered))
-        return [made]
+    def _by(self, estimator: AzigramConfig) -> Azimuths:
+        """The azimuth detector's stage with an estimator; several may be at work beside each other."""
+        config = self.config
+        learned = _learned_azimuth(config) if config.detector in ("learned", "learned-azimuth") else None
+
+        def order(held: xr.DataArray, minutes: np.ndarray, null: np.ndarray | None) -> list[Future]:
+            return self._ordered("azimuth", held, minutes, null)
+
+        return Azimuths(estimator, config.azimuth, config.spectra.hop_s, learned, order)
+
+    def _by_polarisation(self) -> Azimuths:
+        return self._by(replace(self.config.azigram, method="polarisation"))
+
+    def _by_each(self) -> list[Azimuths]:
+        return [self._azimuths] if self._axes is None else [self._azimuths, self._axes]
+
+    def _azimuth_maps(
+        self, minutes: np.ndarray, spectra: xr.Dataset | None
+    ) -> tuple[list[Future], list[Future]]:
+        """Take what the next spectra say of azimuth, and begin some minutes; none without horizontals.
+
+        The second are azimuths by polarisation, of what was heard while the hydrophone of the record was silent.
+        """
+        if spectra is not None:
+            self._azimuths.take(spectra)
+            alone = unheard(spectra)
+            if self._axes is None and alone.any() and self.config.azigram.method == "auto":
+                self._axes = self._by_polarisation()
+            if self._axes is not None:
+                self._axes.take(horizontals(spectra, alone))
+        return self._azimuths.maps(minutes), [] if self._axes is None else self._axes.maps(minutes)
 
     def _range_maps(self, minutes: np.ndarray, spectra: xr.Dataset | None) -> list[Future]:
         """Take what the next spectra say of range, and begin some minutes; none without a hydrophone."""
@@ -423,7 +433,7 @@ class Pipeline:
         step = self.config.azimuth.step_s
         for name, held in (
             ("power", self._spectrogram),
-            ("azigram", self._azigram),
+            ("azigram", self._azimuths.azigram),
             ("cepstrogram", self._cepstrogram),
         ):
             if held is not None:
@@ -431,21 +441,13 @@ class Pipeline:
         return xr.Dataset(features).assign_coords(time=from_posix(minutes))
 
     def _forget(self, before: float) -> None:
-        if self._learned is not None:
-            self._learned.forget(before)
-        if self._azigram is not None:
-            keep = to_posix(self._azigram["time"].values) >= before
-            self._azigram = self._azigram[:, keep]
-            self._null = None if self._null is None else self._null[:, keep]
+        for azimuths in self._by_each():
+            azimuths.forget(before)
         if self._cepstrogram is not None:
             self._cepstrogram = self._cepstrogram[:, to_posix(self._cepstrogram["time"].values) >= before]
         if self._spectrogram is not None and self._lines is not None:
             keep = to_posix(self._spectrogram["time"].values) >= before
             self._spectrogram, self._lines = self._spectrogram[:, keep], self._lines[:, keep]
-
-
-def _under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
 def _learned_azimuth(config: RunConfig) -> LearnedAzimuthDetector:
@@ -471,7 +473,3 @@ def _follower(table: xr.Dataset, amplitudes: Amplitudes | None) -> StationFocali
     from obsnet.trackers.station_focalization import StationFocalization
 
     return StationFocalization(table, amplitudes=amplitudes)
-
-
-def _join(held: np.ndarray, new: np.ndarray | None) -> np.ndarray | None:
-    return None if new is None else np.concatenate([held, new], axis=1)

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
-from obsnet.detectors.maps import LikelihoodMaps
+from obsnet.detectors.maps import LikelihoodMaps, two_sided
 from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
@@ -230,13 +230,13 @@ def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: R
 
     `_MuteHydrophone` where it is for the hydrophone alone.
     """
-    if (detections["coverage"] > 0).any():
-        return
     pressure, horizontals = source.station.pressure, source.station.horizontals
     frames = {seed_id: channel.usable_frames for seed_id, channel in source.report.channels.items()}
     others_work = len(horizontals) > 1 and all(frames.get(channel.seed_id) for channel in horizontals)
     if pressure is not None and not frames.get(pressure.seed_id) and others_work:
         raise _MuteHydrophone(pressure.seed_id)
+    if (detections["coverage"] > 0).any():
+        return
     begin, end = (iso(ns / 1e9) for ns in (source.begin_ns, source.end_ns))
     why = [
         f"{seed_id}: {channel.gap_s:g} s of gaps, {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
@@ -292,9 +292,25 @@ def segment_tracks(
     new = search(run.maps, segment, delay, run.config.grid_search, threads, near, ghosts)
     if not new and not near and not _range_heard(run, segment):
         new = _by_bearings(run, segment, delay)
-    if run.maps.get("azimuth") is not None and run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
-        new = [replace(track, method=f"{track.method}; course ambiguous by 180°") for track in new]
-    return new
+    return [
+        replace(t, method=f"{t.method}; course ambiguous by 180°") if _two_sided(run, t) else t for t in new
+    ]
+
+
+def _two_sided(run: Run, track: Track) -> bool:
+    """Whether none of a track's minutes with an azimuth tells it from the opposite one."""
+    if "azimuth_llr" not in run.maps:
+        return False
+    if run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
+        return True
+    times = to_posix(run.maps["time"].values)
+    said = (
+        run.maps["azimuth_llr"]
+        .isel(time=np.flatnonzero((times >= track.start) & (times <= track.end)))
+        .values
+    )
+    said = said[np.nan_to_num(said).max(axis=1) > 0]
+    return bool(len(said) and two_sided(said).all())
 
 
 def _followed(run: Run) -> list[Segment]:
@@ -304,7 +320,9 @@ def _followed(run: Run) -> list[Segment]:
     if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
         raise ConfigError(NEEDS_FULL_AZIMUTHS)
     times = to_posix(run.maps["time"].values)
-    held = track_azimuth(times, run.maps["azimuth_llr"].values, run.maps["azimuth"].values)
+    azimuth_llr = run.maps["azimuth_llr"].values
+    azimuth_llr = np.where(two_sided(azimuth_llr)[:, None], np.nan, azimuth_llr)
+    held = track_azimuth(times, azimuth_llr, run.maps["azimuth"].values)
     run.live = pd.DataFrame(
         {
             "time": run.maps["time"].values,
@@ -394,6 +412,10 @@ def _notes(run: Run) -> list[str]:
         notes.append("no two horizontals: range only, courses are not observed")
     if len(run.presence) and "range" not in run.presence:
         notes.append("no hydrophone: azimuth from polarisation, ambiguous by 180°, no range")
+    elif "azimuth_llr" in run.maps and (alone := two_sided(run.maps["azimuth_llr"].values).sum()):
+        notes.append(
+            f"the hydrophone is silent in {alone} minutes: their azimuths are from polarisation, known on which axis but not to which side"
+        )
     return notes
 
 

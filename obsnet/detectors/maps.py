@@ -51,6 +51,34 @@ def joined(parts: list[xr.Dataset]) -> xr.Dataset:
     return xr.concat(parts, "time", data_vars="minimal", coords="minimal", compat="override", join="override")
 
 
+def filled_up(maps: LikelihoodMaps, axes: LikelihoodMaps) -> LikelihoodMaps:
+    """Azimuth maps whose minutes without data are those of others, by polarisation."""
+    fill = (maps["azimuth_coverage"].values == 0) & (axes["azimuth_coverage"].values > 0)
+    return maps.assign(
+        azimuth_llr=maps["azimuth_llr"].copy(
+            data=np.where(fill[:, None], axes["azimuth_llr"].values, maps["azimuth_llr"].values)
+        ),
+        azimuth_coverage=maps["azimuth_coverage"].copy(
+            data=np.where(fill, axes["azimuth_coverage"].values, maps["azimuth_coverage"].values)
+        ),
+    )
+
+
+def two_sided(azimuth_llr: np.ndarray) -> np.ndarray:
+    """Minutes whose azimuths are known up to 180° alone (polarisation): their ratios say the same of opposite sides.
+
+    Parameters
+    ----------
+    azimuth_llr : (time, azimuth), the azimuths evenly around the circle.
+    """
+    half, odd = divmod(azimuth_llr.shape[1], 2)
+    if odd:
+        return np.zeros(len(azimuth_llr), bool)
+    one, other = azimuth_llr[:, :half], azimuth_llr[:, half:]
+    says = one.max(axis=1) - one.min(axis=1) > TIE
+    return says & (abs(one - other) <= TIE).all(axis=1)
+
+
 def window_bounds(
     frame_time: np.ndarray, minutes: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -193,7 +221,8 @@ def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.D
     Returns
     -------
     DataFrame with columns time, coverage, azimuth_deg, azimuth_llr, range_m, range_rate_mps, range_llr. The `_llr` columns
-    are log marginal posterior ratios of presence, filled where there is coverage; estimates are NaN where they are ≤ 0.
+    are log marginal posterior ratios of presence, filled where there is coverage; estimates are NaN where they are ≤ 0, and
+    the azimuth where it is known up to 180° alone while the record's others are known.
     """
     ratios = presence(maps) if ratios is None else ratios
     empty = np.full(maps.sizes["time"], np.nan)
@@ -206,6 +235,8 @@ def detections(maps: LikelihoodMaps, ratios: pd.DataFrame | None = None) -> pd.D
         covered = np.maximum(covered, maps["azimuth_coverage"].values)
         table["azimuth_llr"] = ratios["azimuth"].to_numpy()
         found = table["azimuth_llr"] > 0
+        if maps["azimuth"].attrs.get("ambiguity_deg", 360) == 360:
+            found &= ~two_sided(maps["azimuth_llr"].values)
         table["azimuth_deg"][found] = _peak_azimuth(maps["azimuth_llr"].values[found], maps["azimuth"].values)
     if "range_llr" in maps:
         covered = np.maximum(covered, maps["range_coverage"].values)

@@ -33,6 +33,11 @@ def taken_up(arrays: Mapping[str, np.ndarray]) -> xr.DataArray | None:
     return xr.DataArray(arrays["values"], coords, said["dims"], said["name"], said["attrs"])
 
 
+def under(state: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """What a state holds under a name, without it."""
+    return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
+
+
 def power_of(spectra: xr.Dataset) -> xr.DataArray:
     """The component whose power is shown: the pressure, or the ground motion without one."""
     return spectra[next(name for name in ("p", "down", "north", "east") if name in spectra)]

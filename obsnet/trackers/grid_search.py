@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from obsnet.detectors.maps import two_sided
 from obsnet.kinematics import BentCourse, StraightCourse
 from obsnet.trackers.bends import BENDS, MARGIN_S, TURN, bends
 from obsnet.trackers.course_grid import (
@@ -101,7 +102,8 @@ def search(
     given = {"azimuth_llr": azimuth_llr, "range_llr": range_llr}
     maps = maps.drop_vars([name for name in given if name in maps and given[name] is None])
     lines = None if level is None or not config.lines else Lines.of(level, maps["line_frequency"].values)
-    finder = _Finder(maps, times, delay, config, threads, lines)
+    both = None if azimuth_llr is None else two_sided(azimuth_llr)
+    finder = _Finder(maps, times, delay, config, threads, lines, both)
     left = azimuth_llr, range_llr
     for track in known:
         # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.
@@ -124,6 +126,7 @@ class _Finder:
         config: GridSearchConfig,
         threads: int,
         lines: Lines | None = None,
+        both: np.ndarray | None = None,
     ) -> None:
         self.config, self.threads, self.lines = config, threads, lines
         self.origin = times[0]
@@ -132,13 +135,10 @@ class _Finder:
         self.range_m = maps["range"].values if "range_llr" in maps else np.array([0.0, 1.0, 2.0])
         self.rate = maps["range_rate"].values if "range_llr" in maps else np.array([-1.0, 0.0, 1.0])
         self.sees_course = "azimuth_llr" in maps
-        self.ambiguity_deg = int(maps["azimuth"].attrs.get("ambiguity_deg", 360)) if self.sees_course else 360
         self.sees_range = "range_llr" in maps
         self._runs = float(np.log(len(times) * (len(times) + 1) / 2))
         self.delay = Delay(np.asarray(delay(np.arange(0.0, 150_001.0, 250.0)), float), 250.0)
-        self.remainder = Remainder(
-            times, self.delay, self.azimuth, self.range_m, self.rate, self.ambiguity_deg
-        )
+        self.remainder = Remainder(times, self.delay, self.azimuth, self.range_m, self.rate, both)
         self._everywhere: CourseGrid | None = None
 
     def one_by_one(

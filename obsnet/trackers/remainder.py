@@ -83,7 +83,8 @@ class Remainder:
     Parameters
     ----------
     tiles : (n_tiles) s since 1970. delay : travel time of the sound.
-    azimuth, range_m, rate : axes of the maps [deg, m, m/s]. ambiguity_deg : up to which azimuths are known.
+    azimuth, range_m, rate : axes of the maps [deg, m, m/s].
+    two_sided : (n_tiles) where azimuths are known up to 180° alone; by default nowhere.
     """
 
     def __init__(
@@ -93,9 +94,12 @@ class Remainder:
         azimuth: np.ndarray,
         range_m: np.ndarray,
         rate: np.ndarray,
-        ambiguity_deg: int = 360,
+        two_sided: np.ndarray | None = None,
     ) -> None:
-        self._tiles, self._delay, self._ambiguity_deg = tiles, delay, ambiguity_deg
+        self._tiles, self._delay = tiles, delay
+        self._turns = [(0.0, np.ones(len(tiles), bool))]
+        if two_sided is not None and two_sided.any():
+            self._turns.append((180.0, two_sided))
         self._azimuth, self._range_m, self._rate = azimuth, range_m, rate
         self._taken: list[tuple[Track, float]] = []
 
@@ -120,10 +124,11 @@ class Remainder:
         if azimuth_llr is not None:
             # A ship that keeps its range but not its azimuth has turned: what is heard nearby is still that ship.
             explained = np.zeros(azimuth_llr.shape, bool)
-            for turn in range(0, 360, self._ambiguity_deg):
+            for turn, there in self._turns:
                 beside = abs(wrap180(self._azimuth[None, :] - azimuth[:, None] - turn)) <= TURN_DEG
-                explained |= beside & ranged[:, None]
-                explained |= lobe(azimuth_llr, self._azimuth, azimuth + turn, TURN_DEG)
+                beside &= ranged[:, None]
+                beside |= lobe(azimuth_llr, self._azimuth, azimuth + turn, TURN_DEG)
+                explained |= beside & there[:, None]
             explained &= np.isfinite(distance)[:, None]
             # Where one ship is loud, a ship anywhere may explain more than none: the next is held against the first.
             azimuth_llr = above_floor(

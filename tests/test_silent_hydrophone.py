@@ -1,0 +1,95 @@
+"""A hydrophone that stops working costs the range and the azimuth's side, not the azimuth."""
+
+import numpy as np
+import obspy
+import pytest
+
+import obsnet
+from obsnet.detectors.maps import two_sided
+from obsnet.kinematics import wrap180
+from obsnet.layout import to_posix
+from obsnet.pipeline import Pipeline, RunConfig
+from obsnet.signals.spectra import SpectraConfig, iter_spectra
+from obsnet.signals.station import Station
+from obsnet.signals.waveforms import open_waveforms
+
+CPA = obspy.UTCDateTime("2013-05-21T11:00:00Z")
+"""Of the record's ship, 6 km off, on course 60° at 8 m/s."""
+
+
+@pytest.fixture(scope="module")
+def station(record):
+    return Station.from_stationxml(record / "station.xml")
+
+
+@pytest.fixture(scope="module", params=["analytic", "learned"])
+def runs(request, stream, station):
+    """The whole record, and as it is when the hydrophone sticks at one value from the CPA on."""
+    broken = stream.copy()
+    for trace in broken.select(channel="BDH"):
+        trace.data = trace.data.copy()
+        trace.data[round((CPA - trace.stats.starttime) * trace.stats.sampling_rate) :] = 1234
+    return tuple(obsnet.track(given, station, detector=request.param) for given in (stream, broken))
+
+
+def after(run, seconds):
+    return to_posix(run.maps["time"].values) > CPA.timestamp + seconds
+
+
+def test_azimuths_go_on_up_to_180_degrees(runs):
+    whole, broken = runs
+    late, early = after(broken, 120.0), ~after(broken, -900.0)  # the network looks at its neighbours
+    said, expected = (run.maps["azimuth_llr"].values for run in runs)
+    assert np.array_equal(said[early], expected[early], equal_nan=True)
+    llr = broken.maps["azimuth_llr"].values
+    assert two_sided(llr)[late].mean() > 0.9 and not two_sided(llr)[early].any()
+    assert (broken.maps["azimuth_coverage"].values[late][:-3] > 0.9).all()
+    heard = late & (whole.detections["azimuth_llr"].to_numpy() > 3)
+    axis = broken.maps["azimuth"].values[llr[heard].argmax(axis=1)]
+    azimuth = whole.detections["azimuth_deg"].to_numpy()[heard]
+    off = abs(wrap180(2.0 * (axis - azimuth))) / 2.0
+    assert heard.sum() > 20 and np.median(off) < 3.0
+
+
+def test_no_side_is_made_up(runs):
+    _, broken = runs
+    late = after(broken, 120.0)
+    said = broken.detections["azimuth_deg"].to_numpy()
+    assert np.isnan(said[late]).all() and np.isfinite(said[~after(broken, -120.0)]).any()
+    assert (broken.detections["azimuth_llr"].to_numpy()[late] > 0).any()
+    assert any("hydrophone is silent" in note for note in broken.info["notes"])
+
+
+def test_the_ship_is_tracked_once_and_past_the_fault(runs):
+    whole, broken = runs
+    (expected,), (track,) = whole.tracks, broken.tracks
+    assert track.end > CPA.timestamp + 600.0
+    assert abs(track.motion.cpa_time - expected.motion.cpa_time) < 60.0
+    assert abs(wrap180(track.motion.course_deg - expected.motion.course_deg)) < 3.0
+    assert "ambiguous" not in track.method
+
+
+@pytest.mark.parametrize("detector", ["analytic", "learned"])
+def test_no_minute_depends_on_how_the_record_is_cut_or_stopped(record, station, detector):
+    config = RunConfig(detector=detector)
+
+    def blocks(block_s):
+        source = open_waveforms(record / "waveforms.mseed", station, endtime="2013-05-21T11:00:00Z")
+        for block in iter_spectra(source, SpectraConfig(block_s=block_s)):
+            times = to_posix(block["time"].values)
+            silent = (times > CPA.timestamp - 2400.0) & (times < CPA.timestamp - 900.0)
+            block["p"].values[:, silent] = np.nan
+            yield block
+
+    whole, cut = Pipeline(station, config), Pipeline(station, config)
+    expected = [m for block in blocks(1024.0) for m in whole.push(block)] + whole.flush()
+    got = []
+    for number, block in enumerate(blocks(122.88)):
+        got += cut.push(block)
+        if number % 5 == 4:
+            state, cut = cut.state(), Pipeline(station, config, table=whole.table)
+            cut.restore(state)
+    got += cut.flush()
+    maps = [np.concatenate([m.maps["azimuth_llr"].values for m in made]) for made in (expected, got)]
+    assert two_sided(maps[0]).sum() > 15
+    np.testing.assert_allclose(*maps, atol=1e-3)
