@@ -28,7 +28,7 @@ from obsnet.trackers.course_grid import (
     score_points,
     shares,
 )
-from obsnet.trackers.line_doppler import Lines, told
+from obsnet.trackers.line_doppler import Lines
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.remainder import Ghosts, Remainder
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
@@ -215,11 +215,12 @@ class _Finder:
 
         With the other one come mean and standard deviation of the speed that it asks for, m/s.
         """
-        start = None
+        rescaled = None
         if self.lines is not None and self.sees_course:
-            start = self.lines.rescaled(point, self._scales(point), self.tiles, self.delay, scores)
-        if start is None:
+            rescaled = self.lines.rescaled(point, self._scales(point), self.tiles, self.delay, scores)
+        if rescaled is None:
             return point, None
+        start, speed = rescaled
         best, found = -np.inf, None
         for nudge in (0.92, 1.0, 1.08):
             centre = start * np.array([1.0, nudge, 1.0, nudge])
@@ -228,7 +229,7 @@ class _Finder:
             best, found = self._level(found, FINE, scores)
         if found is None or self.config.exponent * best - self._runs < least:
             return point, None
-        return found, told(start[3])
+        return found, speed
 
     def _scales(self, point: np.ndarray) -> np.ndarray:
         """Scales of CPA range and speed that the prior allows."""

@@ -26,10 +26,12 @@ LEAST_OF_LINES = 300.0
 """Evidence of lines, nats, below which they tell no scale of simulated ships."""
 LINES_SHARE = 0.2
 """Weight of it beside what range maps say."""
-AGREED = 0.85
-"""Share of the greatest evidence of lines from which on they agree to a scale."""
+AGREED = 0.8
+"""Share of the greatest evidence of lines from which on they agree to a scale: shafts do not turn evenly, and lines that wander by
+0.2 % within ten minutes fall on each other best along a wrong one.
+"""
 BY_LINES = 0.15
-"""Relative standard deviation of a speed that lines tell."""
+"""Relative standard deviation of a speed that lines tell, where they agree to one alone."""
 SAME_SCALE = 0.13
 """Difference of two scales, in natural logarithms, up to which the range maps choose between them."""
 _BASE_HZ = 4.0
@@ -130,17 +132,15 @@ class Lines:
     ) -> tuple[float, float] | None:
         """Mean and standard deviation [m/s] of the speed along a course whose scale nothing else tells, if lines do."""
         said = self._say(point, scales, tiles, delay, scores)
-        if said is None:
-            return None
-        return told(point[3] * scales[said.argmax()])
+        return None if said is None else _told(point[3] * scales, said)
 
     def rescaled(
         self, point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
-    ) -> np.ndarray | None:
+    ) -> tuple[np.ndarray, tuple[float, float]] | None:
         """The course at another scale, if lines do not agree to its own and what they and range maps say together is for it.
 
         What range maps say counts as it is, the lines with a share: lines tell apart what path pairs confuse, and where no range
-        is heard they alone do.
+        is heard they alone do. With the course come mean and standard deviation of the speed that lines tell [m/s].
         """
         said = self._say(point, scales, tiles, delay, scores)
         if said is None:
@@ -151,12 +151,14 @@ class Lines:
         near = np.abs(np.log(scales)) < SAME_SCALE
         if near[best] or (near & agreed).any() or together[near].max(initial=-np.inf) >= together[best]:
             return None
-        return points[best]
+        return points[best], _told(point[3] * scales, said)
 
 
-def told(speed_mps: float) -> tuple[float, float]:
-    """Mean and standard deviation of a speed that lines tell."""
-    return float(speed_mps), float(BY_LINES * speed_mps)
+def _told(speed_mps: np.ndarray, said: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of the speed, of those to which lines agree by what they say for each."""
+    agreed = np.log(speed_mps[said >= AGREED * said.max()])
+    mean = float(np.exp(agreed.mean()))
+    return mean, mean * float(np.hypot(BY_LINES, agreed.std()))
 
 
 def doppler(point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Delay) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.ndimage import gaussian_filter1d
 
 from obsnet.kinematics import StraightCourse
 from obsnet.trackers.course_grid import Delay
@@ -28,10 +29,12 @@ def shift_of(course, times):
     return (emitted(times + 5.0) - emitted(times - 5.0)) / 10.0
 
 
-def levels(course, times, rng, pitches=PITCHES, steady=(), strength=2.5):
-    """Line levels as `line_level` has them: lines of a course that move, lines that stay, noise."""
+def levels(course, times, rng, pitches=PITCHES, steady=(), strength=2.5, wander=0.0):
+    """Line levels as `line_level` has them: lines of a course that move, whose shaft wanders within ten minutes, lines that stay, noise."""
     level = 0.3 * rng.standard_normal((len(times), len(FREQUENCY)))
-    for pitch, moved in [(p, shift_of(course, times)) for p in pitches] + [
+    turns = gaussian_filter1d(rng.standard_normal(len(times)), 300.0 / np.diff(times).mean())
+    turns = 1.0 + wander * turns / turns.std()
+    for pitch, moved in [(p, turns * shift_of(course, times)) for p in pitches] + [
         (p, np.ones(len(times))) for p in steady
     ]:
         level += strength * np.exp(-0.5 * ((FREQUENCY - (pitch * moved)[:, None]) / 0.045) ** 2)
@@ -118,3 +121,30 @@ def test_lines_that_agree_change_nothing():
     (without,) = search(maps, SEGMENT, delay)
     (found,) = search(with_lines(maps, levels(truth, MINUTES, rng)), SEGMENT, delay)
     assert found.motion == without.motion and found.method == without.method
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shaft_that_turns_unevenly_moves_no_ship_whose_range_is_heard(seed):
+    truth = StraightCourse(T0 + 7000.0, 14_000.0, 60.0, 7.5)
+    rng = np.random.default_rng(seed)
+    maps = maps_of([truth], MINUTES, rng)
+    (found,) = search(
+        with_lines(maps, levels(truth, MINUTES, rng, (8.7, 17.4), wander=0.002)), SEGMENT, delay
+    )
+    assert found.motion.speed_mps == pytest.approx(7.5, abs=0.4)
+    assert found.motion.cpa_range_m == pytest.approx(14_000.0, abs=600.0)
+
+
+def test_the_speed_of_uneven_lines_is_as_uncertain_as_they_are():
+    """Of ships whose range is not heard, the stated speeds hold the true ones."""
+    off, std = [], []
+    for seed, speed in enumerate((5.0, 7.0, 9.0, 11.0, 13.0) * 2):
+        truth = StraightCourse(T0 + 7000.0, 6_000.0, 60.0, speed)
+        rng = np.random.default_rng(seed)
+        maps = maps_of([truth], MINUTES, rng).drop_vars(["range_llr", "range_coverage"])
+        (found,) = search(
+            with_lines(maps, levels(truth, MINUTES, rng, (9.5, 19.0), wander=0.002)), SEGMENT, delay
+        )
+        off.append(found.motion.speed_mps - speed)
+        std.append(found.std[3])
+    assert (np.abs(off) < 2.0 * np.array(std)).mean() >= 0.8
