@@ -267,6 +267,20 @@ def test_ambiguous_azimuths_are_compared_modulo_180():
     assert evaluate(table, tracks(), [ship(FIRST)], delay).ships[0].azimuth_n == 0
 
 
+def test_a_track_known_up_to_half_a_turn_is_its_ships_on_either_side():
+    opposite = replace(FIRST, course_deg=FIRST.course_deg + 180.0)
+    azimuth, distance, rate = heard(FIRST)
+    given = detections(azimuth, distance, rate), tracks(opposite), [ship(FIRST)], delay
+    assert evaluate(*given).missed == (1,)
+    found = evaluate(*given, DetectionCriteria(azimuth_period_deg=180.0))
+    assert found.missed == () and found.false_tracks == ()
+    assert abs(found.ships[0].course_error_deg) < 0.5 and abs(found.ships[0].cpa_azimuth_error_deg) < 0.5
+    # Going the other way past the same place is no turn about the station.
+    reverse = tracks(FIRST).assign(course_deg=FIRST.course_deg + 90.0)
+    half = DetectionCriteria(azimuth_period_deg=180.0)
+    assert evaluate(given[0], reverse, *given[2:], half).missed == (1,)
+
+
 def test_table_and_json():
     azimuth, distance, rate = heard(FIRST)
     result = evaluate(

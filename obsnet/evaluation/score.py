@@ -21,7 +21,7 @@ from obsnet.evaluation.detections import (
     step_s,
 )
 from obsnet.evaluation.table import Evaluation, ShipScore
-from obsnet.evaluation.tracks import MatchGates, coverage, match_tracks, track_errors, utc
+from obsnet.evaluation.tracks import MatchGates, coverage, match_tracks, track_errors, turned_to, utc
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.trackers.track import Track
@@ -80,6 +80,8 @@ def evaluate(
         ]
     lines = [track.course_at_cpa() for track in reference]
     compared = compare(detections, reference, delay, criteria)
+    if criteria.azimuth_period_deg == 180.0:
+        tracks = turned_to(lines, tracks, gates)
     matches = match_tracks(tracks, lines, gates)
     nearest = np.inf if expected_cpa_m is None else expected_cpa_m
     ships = tuple(

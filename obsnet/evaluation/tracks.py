@@ -58,6 +58,23 @@ def track_errors(tracks: pd.DataFrame, lines: list[StraightCourse]) -> np.ndarra
     return errors
 
 
+def turned_to(lines: list[StraightCourse], tracks: pd.DataFrame, gates: MatchGates) -> pd.DataFrame:
+    """Tracks known up to half a turn about the station, each on the side on which it comes nearer to a ship's straight course."""
+    if not len(tracks) or not lines:
+        return tracks
+    columns = [name for name in ("course_deg", "cpa_azimuth_deg") if name in tracks]
+    other = tracks.assign(**{name: (tracks[name].to_numpy(float) + 180.0) % 360.0 for name in columns})
+    as_is, opposite = (
+        np.nansum(_scaled(side, lines, gates) ** 2, axis=2).min(axis=1) for side in (tracks, other)
+    )
+    return tracks.where(pd.Series(as_is <= opposite, tracks.index), other)
+
+
+def _scaled(tracks: pd.DataFrame, lines: list[StraightCourse], gates: MatchGates) -> np.ndarray:
+    """Sizes of errors in units of the gates."""
+    return np.abs(track_errors(tracks, lines)) / [getattr(gates, field.name) for field in fields(gates)]
+
+
 def utc(column: pd.Series) -> pd.Series:
     """Times without time zone (datetime64[ns], UTC) of a column of ISO 8601 text or of times."""
     return pd.to_datetime(column, format="ISO8601", utc=True).dt.tz_localize(None).astype("datetime64[ns]")
@@ -81,8 +98,7 @@ def match_tracks(
     """
     if not len(tracks) or not lines:
         return {}
-    limits = np.array([getattr(gates, field.name) for field in fields(gates)])
-    scaled = np.abs(track_errors(tracks, lines)) / limits
+    scaled = _scaled(tracks, lines, gates)
     allowed = ~(scaled > 1.0).any(axis=2) & np.isfinite(scaled[..., 0])
     forbidden = 1e6
     cost = np.where(allowed, np.nansum(scaled**2, axis=2), forbidden)

@@ -35,34 +35,16 @@ from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, 
 from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
+from obsnet.trackers.verdict import believable, is_no_remainder, is_one, is_sharp, required
 
 LINGERS = 2.0
 """How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
-
-LOOSEST = (3600.0, 15_000.0)
-"""Standard deviations of CPA time [s] and range [m] from which on nothing is located."""
-
-LOOSEST_NEXT = (900.0, 3000.0)
-"""The same of a further ship: what is left of a known one is a piece of course that fits many."""
-
-SHARP = (120.0, 500.0)
-"""Standard deviations of CPA time [s] and range [m] of what is located sharply, as what is left of a known ship is not."""
-
-BRIEF = 0.5
-"""Share of `shortest_s` for which such a ship must be heard, if it moves beyond the doubt that is allowed a ship apart."""
-
-APART = 0.1
-"""Share of the time that a ship is heard up to which others may be heard in it too for it to be apart from them."""
 
 COARSE_SHARE = 0.6
 """What the bound of a coarse cell is at least of the best score in it."""
 
 POINTED = 4.0
 """What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's, and located sharply."""
-
-AGREEING = 0.5
-"""Share of the tiles in which the sensor that hears a ship less hears it, in which the other one must hear it too: else the course
-is one ship's range and another's azimuth."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -162,14 +144,14 @@ class _Finder:
                 break
             jointly = bool(number or known) and self.sees_course and ghosts is None
             found = self.find(azimuth_llr, range_llr, least, jointly)
-            mixed = not jointly and ghosts is None and found is not None and not _is_one(found)
+            mixed = not jointly and ghosts is None and found is not None and not is_one(found)
             if mixed:
                 found = self.find(azimuth_llr, range_llr, least, True)
-            if found is None or found.log_bayes_factor < self.required(found, others):
+            if found is None or found.log_bayes_factor < required(found, others, config):
                 break
-            pointed = ghosts is None or (found.extra["pointed"] >= POINTED and _is_sharp(found))
+            pointed = ghosts is None or (found.extra["pointed"] >= POINTED and is_sharp(found))
             one_of_many = bool(others) or mixed
-            if pointed and self.believable(found) and (not one_of_many or _is_no_remainder(found)):
+            if pointed and believable(found, config) and (not one_of_many or is_no_remainder(found)):
                 tracks.append(found)
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
             if ghosts is not None and range_llr is not None:
@@ -355,7 +337,7 @@ class _Finder:
         track = Track(
             start, end, self._course(mean), self._of_table(cov, mean), log_bayes_factor, method, extra
         )
-        worth = log_bayes_factor >= config.min_log_bayes_factor and self.believable(track)
+        worth = log_bayes_factor >= config.min_log_bayes_factor and believable(track, config)
         if worth and self.sees_course and self.sees_range:
             track = self._bent(track, known, scores, speed)
         return track
@@ -415,30 +397,6 @@ class _Finder:
         scaled = self.config.range_scale_std * np.array([0.0, mean[1], 0.0, mean[3]])
         return covariance + (np.outer(scaled, scaled) if self.sees_range else 0.0)
 
-    def believable(self, track: Track) -> bool:
-        """Whether a track moves as a ship does, is known well enough to be one, and lies within the prior, not against its edge."""
-        config = self.config
-        slack = 0.02 * (config.max_speed_mps - config.min_speed_mps)
-        within_speed = config.min_speed_mps + slack < track.motion.speed_mps < config.max_speed_mps - slack
-        moving = track.extra["log_bayes_factor_fixed"]
-        brief = BRIEF if _is_sharp(track) and moving >= config.min_log_bayes_factor_apart else 1.0
-        long_enough = track.end - track.start >= brief * config.shortest_s - config.tile_s
-        within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
-        located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
-        moves = moving >= config.min_log_bayes_factor
-        moves &= track.extra.get("score", 0.0) > track.extra.get("steady", -np.inf)
-        return bool(long_enough and within_speed and within_range and located and moves and _is_one(track))
-
-    def required(self, track: Track, others: Sequence[Track]) -> float:
-        """The log Bayes factor that a track must reach beside what else is known."""
-        config = self.config
-        if not others or _is_sharp(track):
-            return config.min_log_bayes_factor
-        shared = sum(min(track.end, other.end) - max(track.start, other.start) for other in others
-                     if other.start < track.end and other.end > track.start)  # fmt: skip
-        alone = shared < APART * (track.end - track.start)
-        return config.min_log_bayes_factor_apart if alone else config.min_log_bayes_factor_next
-
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
         return (
@@ -479,19 +437,3 @@ class _Finder:
         first = float(self.range_m[0]) + spacing * (pool - 1) / 2
         geometry = np.array([first, spacing * pool, float(self.rate[0]), rate_step])
         return ScoreMaps(range_score, geometry, azimuth_score, step, jointly)
-
-
-def _is_sharp(track: Track) -> bool:
-    """Whether a track's CPA is located sharply."""
-    return bool(track.std[0] < SHARP[0] and track.std[1] < SHARP[1])
-
-
-def _is_one(track: Track) -> bool:
-    """Whether a track's range and azimuth are heard in the same tiles, as one ship's are."""
-    return bool(track.extra.get("agreeing", 1.0) >= AGREEING)
-
-
-def _is_no_remainder(track: Track) -> bool:
-    """Whether a further ship is heard, and located, as what is left of a known one is not."""
-    located = track.std[0] < LOOSEST_NEXT[0] and track.std[1] < LOOSEST_NEXT[1]
-    return bool(located and track.extra["heard"] >= 0.5)

@@ -385,6 +385,15 @@ def test_azimuths_without_data_are_no_azimuths():
     assert np.isnan(found.row(1)["course_deg"]) and "course not observed" in found.method
 
 
+def test_a_slow_ship_is_found_though_not_one_against_the_edge_of_the_prior():
+    for speed, ships in ((3.15, 1), (2.6, 0)):
+        truth = StraightCourse(T0 + 7000.0, 5_000.0, 60.0, speed)
+        maps = maps_of([truth], MINUTES, np.random.default_rng(11))
+        found = search(maps.drop_vars(["azimuth_llr", "azimuth_coverage", "azimuth"]), SEGMENT, delay)
+        assert len(found) == ships
+        assert all(abs(track.motion.speed_mps - speed) < 0.1 for track in found)
+
+
 def test_missing_minutes_say_nothing():
     truth = StraightCourse(T0 + 7000.0, 10_000.0, 60.0, 9.0)
     maps = maps_of([truth], MINUTES, np.random.default_rng(9))
