@@ -20,7 +20,9 @@ def maps(jointly):
     rng = np.random.default_rng(4)
     geometry = np.array([0.0, 500.0, -13.0, 1.0])
     azimuth = np.repeat(rng.standard_normal((12, 12)), 30, axis=1)
-    return ScoreMaps(rng.standard_normal((12, 30, 27)), geometry, azimuth, 1.0, jointly)
+    return ScoreMaps(
+        rng.standard_normal((12, 30, 27), np.float32), geometry, azimuth.astype(np.float32), 1.0, jointly
+    )
 
 
 def slow_share(scores, tile, cpa_time, cpa_range, course, speed):
