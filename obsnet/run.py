@@ -439,7 +439,7 @@ def read_run(folder: str | Path) -> Run:
         station, config = Station(code, *place), build(RunConfig, info["config"])
         maps, features = (_minutes(folder / f"{name}.nc", len(found)) for name in ("maps", "features"))
         spans = [
-            Segment(*(s[key] and _seconds(s[key]) for key in ("start", "end", "cpa")))
+            Segment(_seconds(s["start"]), _seconds(s["end"]), s["cpa"] and _seconds(s["cpa"]))
             for s in info["segments"]
         ]
         tracks = [track_of_row(row) for _, row in rows.iterrows()]

@@ -35,7 +35,7 @@ from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, 
 from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
-from obsnet.trackers.verdict import believable, is_no_remainder, is_one, is_sharp, required
+from obsnet.trackers.verdict import believable, is_cut_off, is_no_remainder, is_one, is_sharp, required
 
 LINGERS = 2.0
 """How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
@@ -85,7 +85,7 @@ def search(
     maps = maps.drop_vars([name for name in given if name in maps and given[name] is None])
     lines = None if level is None or not config.lines else Lines.of(level, maps["line_frequency"].values)
     both = None if azimuth_llr is None else two_sided(azimuth_llr)
-    finder = _Finder(maps, times, delay, config, threads, lines, both)
+    finder = _Finder(maps, times, delay, config, threads, lines, both, segment.cut)
     left = azimuth_llr, range_llr
     for track in known:
         # Long after it has gone, the next ship on its lane comes from or goes to the same azimuth.
@@ -109,9 +109,11 @@ class _Finder:
         threads: int,
         lines: Lines | None = None,
         both: np.ndarray | None = None,
+        cut: tuple[bool, bool] = (False, False),
     ) -> None:
         self.config, self.threads, self.lines = config, threads, lines
         self.origin = times[0]
+        self._cuts = times[0] if cut[0] else -np.inf, times[-1] if cut[1] else np.inf
         self.tiles = times - self.origin
         self.azimuth = maps["azimuth"].values if "azimuth_llr" in maps else np.arange(0.0, 360.0, 1.0)
         self.range_m = maps["range"].values if "range_llr" in maps else np.array([0.0, 1.0, 2.0])
@@ -151,7 +153,8 @@ class _Finder:
                 break
             pointed = ghosts is None or (found.extra["pointed"] >= POINTED and is_sharp(found))
             one_of_many = bool(others) or mixed
-            if pointed and believable(found, config) and (not one_of_many or is_no_remainder(found)):
+            whole = not one_of_many or (is_no_remainder(found) and not is_cut_off(found, *self._cuts))
+            if pointed and believable(found, config) and whole:
                 tracks.append(found)
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
             if ghosts is not None and range_llr is not None:

@@ -137,9 +137,9 @@ def _split(
         if sign == -1 and following == 1:
             cpa = middle
         elif sign == 1 and following == -1 and min(middle - start, time[hi - 1] - middle) >= shortest:
-            pieces.append(Segment(start, middle, cpa))
+            pieces.append(Segment(start, middle, cpa, (bool(pieces), True)))
             start, cpa = middle, None
-    pieces.append(Segment(start, time[hi - 1], cpa))
+    pieces.append(Segment(start, time[hi - 1], cpa, (bool(pieces), False)))
     return pieces
 
 

@@ -25,11 +25,14 @@ def usual(speed_mps: np.ndarray, spread_mps: float, known: tuple[float, float] =
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of time in which one ship is heard: start, CPA where approach turns into departure, end (s since 1970)."""
+    """A stretch of time in which one ship is heard: start, CPA where approach turns into departure, end (s since 1970); and whether
+    a ship is heard right before it and right after it, in another segment.
+    """
 
     start: float
     end: float
     cpa: float | None = None
+    cut: tuple[bool, bool] = (False, False)
 
 
 @dataclass(frozen=True)

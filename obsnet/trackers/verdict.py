@@ -70,3 +70,11 @@ def is_no_remainder(track: Track) -> bool:
     """Whether a further ship is heard, and located, as what is left of a known one is not."""
     located = track.std[0] < LOOSEST_NEXT[0] and track.std[1] < LOOSEST_NEXT[1]
     return bool(located and track.extra["heard"] >= 0.5)
+
+
+def is_cut_off(track: Track, begin: float, end: float) -> bool:
+    """Whether a further ship is heard to where another segment is, before `begin` or after `end` [s since 1970], and not about its
+    CPA, nor located sharply: it is then that segment's, which hears it on; so short a piece of it fits many courses.
+    """
+    passes = track.start <= track.motion.cpa_time <= track.end
+    return not (passes or is_sharp(track)) and bool(track.start <= begin or track.end >= end)
