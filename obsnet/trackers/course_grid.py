@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from obsnet.trackers.score_maps import ScoreMaps, polyphase
 
 _CELLS_AT_ONCE, _PLACES_AT_ONCE = 1 << 16, 1 << 14
-_FIRST_BATCH, _LARGEST_BATCH = 512, 1 << 20
+_FIRST_BATCH, _LARGEST_BATCH = 512, 1 << 18
 _TILES_AT_ONCE = 8
 _SECTOR = 6
 """Courses that are left out or scored together."""

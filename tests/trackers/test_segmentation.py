@@ -73,6 +73,7 @@ def test_a_segment_is_said_while_the_record_goes_on_once_nothing_can_change_it()
 def test_departure_before_an_approach_splits():
     first, second = segments(presence(ships=[(200, 350, 500), (500, 650, 800)]))
     assert first.end == second.start == pytest.approx(T0 + 60 * 500, abs=60 * 20)
+    assert (first.cut, second.cut) == ((False, True), (True, False))
     assert first.cpa == pytest.approx(T0 + 60 * 350, abs=600)
     assert second.cpa == pytest.approx(T0 + 60 * 650, abs=600)
 
