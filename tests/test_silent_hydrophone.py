@@ -2,10 +2,12 @@
 
 import numpy as np
 import obspy
+import pandas as pd
 import pytest
 
 import obsnet
 from obsnet.detectors.maps import two_sided
+from obsnet.experiments.ablation_minutes import minute_table
 from obsnet.kinematics import wrap180
 from obsnet.layout import to_posix
 from obsnet.pipeline import Pipeline, RunConfig
@@ -58,6 +60,13 @@ def test_no_side_is_made_up(runs):
     assert np.isnan(said[late]).all() and np.isfinite(said[~after(broken, -120.0)]).any()
     assert (broken.detections["azimuth_llr"].to_numpy()[late] > 0).any()
     assert any("hydrophone is silent" in note for note in broken.info["notes"])
+
+
+def test_minutes_known_up_to_180_degrees_are_scored_so(runs, record):
+    _, broken = runs
+    table = minute_table(broken.maps, pd.read_csv(record / "truth.csv"))
+    said = (after(broken, 120.0) & (table["azimuth_llr"] > 1)).to_numpy()
+    assert said.sum() > 10 and table["azimuth_right"][said].mean() > 0.9
 
 
 def test_the_ship_is_tracked_once_and_past_the_fault(runs):

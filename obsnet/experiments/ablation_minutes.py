@@ -7,7 +7,7 @@ import pandas as pd
 import xarray as xr
 from scipy.special import logsumexp
 
-from obsnet.detectors.maps import azimuth_presence, range_presence
+from obsnet.detectors.maps import azimuth_presence, range_presence, two_sided
 from obsnet.kinematics import wrap180
 from obsnet.layout import to_posix
 
@@ -67,7 +67,7 @@ def minute_table(maps: xr.Dataset, truth: pd.DataFrame) -> pd.DataFrame:
 def _azimuth(maps: xr.Dataset, ships: np.ndarray) -> dict[str, np.ndarray]:
     llr, grid = maps["azimuth_llr"].values.astype(float), maps["azimuth"].values
     best = grid[np.nan_to_num(llr, nan=-np.inf).argmax(axis=1)]
-    period = float(maps["azimuth"].attrs.get("ambiguity_deg", 360))
+    period = np.where(two_sided(llr), 180.0, float(maps["azimuth"].attrs.get("ambiguity_deg", 360)))
     error = _least(wrap180((best - ships[:, 0]) * 360.0 / period) * period / 360.0, llr.shape[0])
     cells, holds = azimuth_cells(maps, ships)
     return {
