@@ -24,7 +24,7 @@ from obsnet.detectors.analytic import (
     RangeDetectorConfig,
 )
 from obsnet.detectors.azimuth_features import LOOK_AHEAD_S, FeatureConfig
-from obsnet.detectors.azimuths import Azimuths, horizontals, unheard
+from obsnet.detectors.azimuths import HORIZONTALS, Azimuths, horizontals, unheard
 from obsnet.detectors.lines import line_level, line_power
 from obsnet.detectors.maps import (
     MARGINAL,
@@ -52,8 +52,6 @@ if TYPE_CHECKING:
     from obsnet.detectors.learned import LearnedAzimuthDetector
     from obsnet.detectors.learned_range import LearnedRangeDetector
     from obsnet.trackers.station_focalization import StationFocalization, StationScans
-
-_HORIZONTALS = {"east", "north"}
 
 NEEDS_FULL_AZIMUTHS = "the bernoulli tracker follows full azimuths, which need two horizontals and a hydrophone; use --tracker grid"
 
@@ -195,7 +193,7 @@ class Pipeline:
             self._next = None
             for azimuths in self._by_each():
                 azimuths.restart()
-        if self.config.tracker == "bernoulli" and not set(spectra) >= {*_HORIZONTALS, "p"}:
+        if self.config.tracker == "bernoulli" and not set(spectra) >= {*HORIZONTALS, "p"}:
             raise ConfigError(NEEDS_FULL_AZIMUTHS)
         if self._next is None:
             first = max(times[0], self.begin)
@@ -203,7 +201,7 @@ class Pipeline:
         self._last = float(times[-1])
         ready = times[-1] - self.config.azimuth.window_s / 2
         learned = self._azimuths.learned is not None
-        looks = learned and (self._azimuths.azigram is not None or set(spectra) >= _HORIZONTALS)
+        looks = learned and (self._azimuths.azigram is not None or set(spectra) >= HORIZONTALS)
         self._begin(ready - LOOK_AHEAD_S if looks else ready + self.config.spectra.hop_s, spectra)
         return finished + self._done(self._most)
 

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
-from obsnet.detectors.maps import LikelihoodMaps, two_sided
+from obsnet.detectors.maps import LikelihoodMaps, known_sides, two_sided
 from obsnet.errors import ConfigError, LayoutError, WaveformError
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
@@ -320,9 +320,7 @@ def _followed(run: Run) -> list[Segment]:
     if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
         raise ConfigError(NEEDS_FULL_AZIMUTHS)
     times = to_posix(run.maps["time"].values)
-    azimuth_llr = run.maps["azimuth_llr"].values
-    azimuth_llr = np.where(two_sided(azimuth_llr)[:, None], np.nan, azimuth_llr)
-    held = track_azimuth(times, azimuth_llr, run.maps["azimuth"].values)
+    held = track_azimuth(times, known_sides(run.maps["azimuth_llr"].values), run.maps["azimuth"].values)
     run.live = pd.DataFrame(
         {
             "time": run.maps["time"].values,

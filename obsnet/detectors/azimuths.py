@@ -19,7 +19,7 @@ from obsnet.signals.held import followed_by, laid_out, taken_up, under
 if TYPE_CHECKING:
     from obsnet.detectors.learned import LearnedAzimuthDetector
 
-_HORIZONTALS = {"east", "north"}
+HORIZONTALS = {"east", "north"}
 
 
 class Azimuths:
@@ -51,7 +51,7 @@ class Azimuths:
 
     def take(self, spectra: xr.Dataset) -> None:
         """The next block of spectra, dims (frequency, time)."""
-        if not set(spectra) >= _HORIZONTALS:
+        if not set(spectra) >= HORIZONTALS:
             return
         azimuths = azigram(spectra, self._estimator)
         if self.learned is not None:
@@ -115,11 +115,11 @@ class Azimuths:
 
 def unheard(spectra: xr.Dataset) -> np.ndarray:
     """Frames (time) in which a hydrophone that the station has is silent, and the horizontals are not."""
-    if not set(spectra) >= {*_HORIZONTALS, "p"}:
+    if not set(spectra) >= {*HORIZONTALS, "p"}:
         return np.zeros(spectra.sizes["time"], bool)
     return np.isnan(spectra["p"].values[0]) & ~np.isnan(spectra["east"].values[0])
 
 
 def horizontals(spectra: xr.Dataset, frames: np.ndarray) -> xr.Dataset:
     """The horizontals alone, NaN but in some frames (bool, time)."""
-    return spectra[sorted(_HORIZONTALS)].where(xr.DataArray(frames, dims="time"))
+    return spectra[sorted(HORIZONTALS)].where(xr.DataArray(frames, dims="time"))

@@ -79,6 +79,11 @@ def two_sided(azimuth_llr: np.ndarray) -> np.ndarray:
     return says & (abs(one - other) <= TIE).all(axis=1)
 
 
+def known_sides(azimuth_llr: np.ndarray) -> np.ndarray:
+    """The maps (time, azimuth) for who follows full azimuths: NaN where they are known up to 180° alone."""
+    return np.where(two_sided(azimuth_llr)[:, None], np.nan, azimuth_llr)
+
+
 def window_bounds(
     frame_time: np.ndarray, minutes: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:

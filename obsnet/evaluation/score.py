@@ -81,7 +81,7 @@ def evaluate(
     lines = [track.course_at_cpa() for track in reference]
     compared = compare(detections, reference, delay, criteria)
     if criteria.azimuth_period_deg == 180.0:
-        tracks = turned_to(lines, tracks, gates)
+        tracks = turned_to(tracks, lines, gates)
     matches = match_tracks(tracks, lines, gates)
     nearest = np.inf if expected_cpa_m is None else expected_cpa_m
     ships = tuple(

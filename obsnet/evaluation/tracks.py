@@ -58,7 +58,7 @@ def track_errors(tracks: pd.DataFrame, lines: list[StraightCourse]) -> np.ndarra
     return errors
 
 
-def turned_to(lines: list[StraightCourse], tracks: pd.DataFrame, gates: MatchGates) -> pd.DataFrame:
+def turned_to(tracks: pd.DataFrame, lines: list[StraightCourse], gates: MatchGates) -> pd.DataFrame:
     """Tracks known up to half a turn about the station, each on the side on which it comes nearer to a ship's straight course."""
     if not len(tracks) or not lines:
         return tracks

@@ -15,7 +15,7 @@ import xarray as xr
 from pyproj import Proj
 
 from obsnet import netcdf
-from obsnet.detectors.maps import LikelihoodMaps, two_sided
+from obsnet.detectors.maps import LikelihoodMaps, known_sides
 from obsnet.errors import FilterError
 from obsnet.kinematics import BentCourse, StraightCourse
 from obsnet.layout import from_posix, iso, to_posix
@@ -51,8 +51,7 @@ class LiveEstimate:
             axes = (maps["range"].values, maps["range_rate"].values) if ranged else (_RANGE_M, _RATE_MPS)
             self._tracker = StationTracker(maps["azimuth"].values, *axes)
         rows = []
-        azimuth_llr = maps["azimuth_llr"].values
-        azimuth_llr = np.where(two_sided(azimuth_llr)[:, None], np.nan, azimuth_llr)
+        azimuth_llr = known_sides(maps["azimuth_llr"].values)
         for i, time in enumerate(to_posix(maps["time"].values)):
             chart = maps["range_llr"].values[i] if ranged else None
             rows.append(self._row(float(time), self._tracker, azimuth_llr[i], chart))

@@ -27,8 +27,8 @@ LEAST_OF_LINES = 300.0
 LINES_SHARE = 0.2
 """Weight of it beside what range maps say."""
 AGREED = 0.8
-"""Share of the greatest evidence of lines from which on they agree to a scale: shafts do not turn evenly, and lines that wander by
-0.2 % within ten minutes fall on each other best along a wrong one.
+"""Share of the greatest evidence of lines from which on they agree to a scale: the lines of a shaft that turns unevenly fall on each
+other best along a wrong one.
 """
 BY_LINES = 0.15
 """Relative standard deviation of a speed that lines tell, where they agree to one alone."""

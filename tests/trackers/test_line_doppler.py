@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d
 
 from obsnet.kinematics import StraightCourse
+from obsnet.trackers import line_doppler
 from obsnet.trackers.course_grid import Delay
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.line_doppler import Lines, doppler
@@ -29,12 +29,10 @@ def shift_of(course, times):
     return (emitted(times + 5.0) - emitted(times - 5.0)) / 10.0
 
 
-def levels(course, times, rng, pitches=PITCHES, steady=(), strength=2.5, wander=0.0):
-    """Line levels as `line_level` has them: lines of a course that move, whose shaft wanders within ten minutes, lines that stay, noise."""
+def levels(course, times, rng, pitches=PITCHES, steady=(), strength=2.5):
+    """Line levels as `line_level` has them: lines of a course that move, lines that stay, noise."""
     level = 0.3 * rng.standard_normal((len(times), len(FREQUENCY)))
-    turns = gaussian_filter1d(rng.standard_normal(len(times)), 300.0 / np.diff(times).mean())
-    turns = 1.0 + wander * turns / turns.std()
-    for pitch, moved in [(p, turns * shift_of(course, times)) for p in pitches] + [
+    for pitch, moved in [(p, shift_of(course, times)) for p in pitches] + [
         (p, np.ones(len(times))) for p in steady
     ]:
         level += strength * np.exp(-0.5 * ((FREQUENCY - (pitch * moved)[:, None]) / 0.045) ** 2)
@@ -123,28 +121,28 @@ def test_lines_that_agree_change_nothing():
     assert found.motion == without.motion and found.method == without.method
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_shaft_that_turns_unevenly_moves_no_ship_whose_range_is_heard(seed):
-    truth = StraightCourse(T0 + 7000.0, 14_000.0, 60.0, 7.5)
-    rng = np.random.default_rng(seed)
-    maps = maps_of([truth], MINUTES, rng)
-    (found,) = search(
-        with_lines(maps, levels(truth, MINUTES, rng, (8.7, 17.4), wander=0.002)), SEGMENT, delay
+@pytest.mark.parametrize(("own", "moved"), [(0.83, False), (0.75, True)])
+def test_lines_overrule_ranges_that_are_heard_only_where_they_deny_them(monkeypatch, own, moved):
+    """A shaft that turns unevenly leaves much for the ship's own scale, and more for a wrong one."""
+    point = np.array([7200.0, 14_000.0, 60.0, 7.5])
+    said = np.interp(
+        np.log(SCALES), [-1.0, -0.2, 0.0, 0.2, 0.4, 0.7, 1.0], [0.3, own, own, own, 1.0, 0.5, 0.3]
     )
-    assert found.motion.speed_mps == pytest.approx(7.5, abs=0.4)
-    assert found.motion.cpa_range_m == pytest.approx(14_000.0, abs=600.0)
+    ranged = np.where(np.abs(np.log(SCALES)) < 0.01, 150.0, 0.0)
+    points = point * np.stack([np.ones_like(SCALES), SCALES, np.ones_like(SCALES), SCALES], axis=1)
+    monkeypatch.setattr(Lines, "_say", lambda *_: 5000.0 * said)
+    monkeypatch.setattr(line_doppler, "at_scales", lambda *_: (points, ranged))
+    lines = Lines(np.zeros((2, 2), np.float32), 3.0, 0.02)
+    found = lines.rescaled(point, SCALES, np.zeros(2), TABLE, None)
+    assert (found is not None) == moved
+    if found is not None:
+        assert found[0][3] == pytest.approx(7.5 * np.exp(0.4), rel=0.01)
 
 
-def test_the_speed_of_uneven_lines_is_as_uncertain_as_they_are():
-    """Of ships whose range is not heard, the stated speeds hold the true ones."""
-    off, std = [], []
-    for seed, speed in enumerate((5.0, 7.0, 9.0, 11.0, 13.0) * 2):
-        truth = StraightCourse(T0 + 7000.0, 6_000.0, 60.0, speed)
-        rng = np.random.default_rng(seed)
-        maps = maps_of([truth], MINUTES, rng).drop_vars(["range_llr", "range_coverage"])
-        (found,) = search(
-            with_lines(maps, levels(truth, MINUTES, rng, (9.5, 19.0), wander=0.002)), SEGMENT, delay
-        )
-        off.append(found.motion.speed_mps - speed)
-        std.append(found.std[3])
-    assert (np.abs(off) < 2.0 * np.array(std)).mean() >= 0.8
+@pytest.mark.parametrize("width", [0.07, 0.42])
+def test_a_speed_told_by_lines_is_as_uncertain_as_the_scales_they_agree_to(monkeypatch, width):
+    point = np.array([7200.0, 14_000.0, 60.0, 7.5])
+    monkeypatch.setattr(Lines, "_say", lambda *_: 1000.0 * (np.abs(np.log(SCALES)) < width))
+    mean, std = Lines(np.zeros((2, 2), np.float32), 3.0, 0.02).speed(point, SCALES, np.zeros(2), TABLE, None)
+    assert mean == pytest.approx(7.5, rel=1e-3)
+    assert std / mean == pytest.approx(np.hypot(0.15, width / np.sqrt(3.0)), abs=0.02)
