@@ -193,6 +193,10 @@ def test_altered_files_are_refused(model, tmp_path):
     (tmp_path / "azimuth.onnx.sha256").write_text((model.parent / "azimuth.onnx.sha256").read_text())
     with pytest.raises(ModelError, match="altered"):
         ModelFile.read(target)
+    for digest in (b"", b" \n", b"\xff\xfe"):
+        (tmp_path / "azimuth.onnx.sha256").write_bytes(digest)
+        with pytest.raises(ModelError, match="altered"):
+            ModelFile.read(target)
     (tmp_path / "half.onnx").write_bytes(model.read_bytes()[: len(content) // 2])
     with pytest.raises(ModelError, match="damaged"):
         ModelFile.read(tmp_path / "half.onnx")
