@@ -35,7 +35,15 @@ from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, 
 from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
-from obsnet.trackers.verdict import believable, is_cut_off, is_no_remainder, is_one, is_sharp, required
+from obsnet.trackers.verdict import (
+    believable,
+    is_cut_off,
+    is_no_remainder,
+    is_one,
+    is_sharp,
+    required,
+    with_ghost,
+)
 
 LINGERS = 2.0
 """How much farther than it was heard a ship of an earlier segment may still explain what is heard."""
@@ -155,7 +163,7 @@ class _Finder:
             one_of_many = bool(others) or mixed
             whole = not one_of_many or (is_no_remainder(found) and not is_cut_off(found, *self._cuts))
             if pointed and believable(found, config) and whole:
-                tracks.append(found)
+                tracks.append(with_ghost(found))
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
             if ghosts is not None and range_llr is not None:
                 range_llr = self.remainder.without_ghosts(ghosts, range_llr)
@@ -320,7 +328,8 @@ class _Finder:
             method = f"grid search, no range {'heard' if self.sees_range else 'maps'}"
         if speed is not None:
             method += f": speed taken as {speed[0]:.3g} ± {speed[1]:.2g} m/s{why}"
-        elif self.sees_course:
+        ghost = None
+        if self.sees_course and not silent:
             ghost = other_scale(
                 best, self.tiles, self.delay, scores, config.min_speed_mps, config.max_speed_mps
             )
@@ -333,6 +342,7 @@ class _Finder:
             "heard": float((per_tile[lo : hi + 1, 0] > 0).mean()),
             "pointed": heard.pointed,
             "agreeing": heard.agreeing if self.sees_course and not silent else 1.0,
+            "other_scale": 1.0 if ghost is None else ghost,
             "steady": two_steady(scores.azimuth_score[lo : hi + 1]) if silent else -np.inf,
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,6 +33,10 @@ AGREEING = 0.5
 is one ship's range and another's azimuth."""
 
 
+GHOST = 0.3
+"""Share of tracks beside which range maps say nearly as much for a ghost, of simulated ships, that are the ghost."""
+
+
 def believable(track: Track, config: GridSearchConfig) -> bool:
     """Whether a track moves as a ship does, is known well enough to be one, and lies within the prior, not against its edge."""
     slack = min(0.02 * (config.max_speed_mps - config.min_speed_mps), EDGE_STD * track.std[3])
@@ -54,6 +59,17 @@ def required(track: Track, others: Sequence[Track], config: GridSearchConfig) ->
                  if other.start < track.end and other.end > track.start)  # fmt: skip
     alone = shared < APART * (track.end - track.start)
     return config.min_log_bayes_factor_apart if alone else config.min_log_bayes_factor_next
+
+
+def with_ghost(track: Track) -> Track:
+    """A track whose covariance covers the ghost for which range maps say nearly as much, if there is one.
+
+    It becomes the mean square about what is stated, of a ship that is where the track is or, with probability `GHOST`, at
+    `extra["other_scale"]` times its CPA range and speed.
+    """
+    apart = track.extra.get("other_scale", 1.0) - 1.0
+    offset = apart * np.array([0.0, track.motion.cpa_range_m, 0.0, track.motion.speed_mps])
+    return replace(track, covariance=track.covariance + GHOST * np.outer(offset, offset))
 
 
 def is_sharp(track: Track) -> bool:

@@ -356,6 +356,9 @@ def test_a_ghost_as_loud_as_the_ship_is_said(strength, open):
         assert float(said[1]) == pytest.approx(12.0, abs=0.5) and float(said[2]) == pytest.approx(
             10.0, abs=0.3
         )
+        assert found.std[1] > 2500.0 and found.std[3] > 2.0
+    else:
+        assert found.std[1] < 500.0
 
 
 def test_azimuths_known_up_to_180_degrees_give_a_ship_once():

@@ -137,7 +137,7 @@ def test_lines_overrule_ranges_that_are_heard_only_where_they_deny_them(monkeypa
     said = np.interp(
         np.log(SCALES), [-1.0, -0.2, 0.0, 0.2, 0.4, 0.7, 1.0], [0.3, own, own, own, 1.0, 0.5, 0.3]
     )
-    ranged = np.where(np.abs(np.log(SCALES)) < 0.01, 150.0, 0.0)
+    ranged = np.where(np.abs(np.log(SCALES)) < 0.01, 50.0, 0.0)
     points = point * np.stack([np.ones_like(SCALES), SCALES, np.ones_like(SCALES), SCALES], axis=1)
     monkeypatch.setattr(Lines, "_say", lambda *_: 5000.0 * said)
     monkeypatch.setattr(line_doppler, "at_scales", lambda *_: (points, ranged))
