@@ -55,6 +55,8 @@ def track(
         station_file, code, start, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
+    if ais:
+        station = placed(station, waveforms, settings, start, end)
     reference = read_reference(ais, station, quiet=quiet) if ais else None
     task = runs.track if tracking else runs.detect
     with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
@@ -230,6 +232,18 @@ def read_station(path: Path, code: str | None, start: str | None, **overrides: A
     return Station.from_stationxml(
         path, code, time=start, **{key: value for key, value in overrides.items() if value is not None}
     )
+
+
+def placed(
+    station: Station, waveforms: list[str], settings: RunConfig, start: str | None, end: str | None
+) -> Station:
+    """The station where it lay when a record begins; the record is looked into where it lay in several places."""
+    if not station.moved:
+        return station
+    from obsnet.signals.waveforms import open_waveforms
+
+    rate_hz = settings.spectra.analysis_rate_hz
+    return open_waveforms(waveforms, station, starttime=start, endtime=end, min_rate_hz=rate_hz).station
 
 
 def _calibrated(

@@ -191,7 +191,7 @@ def _run(
         )
         clock.lap("open")
         sink = FolderSink(folder, station) if folder is not None else MemorySink()
-        with Pipeline(station, config, amplitudes, table, threads) as pipeline, sink:
+        with Pipeline(source.station, config, amplitudes, table, threads) as pipeline, sink:
             clock.lap("model")
             for minutes in _stream(source, config, pipeline, progress, clock):
                 sink.append(minutes)
@@ -205,7 +205,8 @@ def _run(
         station = station.without(mute.seed_id)
         source, pipeline, sink, maps, features = listen(station)
         source.report.left_aside[mute.seed_id] = "never works: gone on as if there were no hydrophone"
-    run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
+    found = sink.detections(), sink.presence()
+    run = Run(source.station, config, maps, features, *found, [], [], pipeline.table)
     if heard is not None:
         heard(run)
     if tracking and len(run.presence):

@@ -13,8 +13,10 @@ import xarray as xr
 from pyproj import Geod
 from threadpoolctl import threadpool_info
 
-from obsnet import Station, detect, netcdf
+from obsnet import Station, commands, detect, netcdf
 from obsnet.kinematics import StraightCourse
+from obsnet.pipeline import RunConfig
+from obsnet.run import read_run
 from obsnet.tables import geojson
 from obsnet.trackers.track import Track
 
@@ -239,7 +241,7 @@ def test_any_split_of_the_record_gives_the_same_rows(tracked, finished, stream, 
 
 def test_a_run_read_again_is_the_run(finished):
     """Segments of the folder's files are those of the run: what tells closing from opening is kept."""
-    from obsnet.run import find_tracks, read_run
+    from obsnet.run import find_tracks
 
     run = read_run(finished)
     found, tracks = find_tracks(run)
@@ -249,11 +251,44 @@ def test_a_run_read_again_is_the_run(finished):
         assert abs(again.motion.cpa_time - kept.motion.cpa_time) < 5.0
 
 
+def test_a_station_that_was_moved_is_where_it_lay_when_its_record_begins(
+    tracked, inventory, record, tmp_path
+):
+    """The record is of the first of two deployments, and so are its depth, its delays and the ships about it."""
+    moved = copy.deepcopy(inventory)
+    (here,) = moved[0]
+    later = copy.deepcopy(here)
+    later.latitude, later.elevation, later.start_date = -45.0, -900.0, START + 86400 * 365
+    for channel in later:
+        channel.start_date = later.start_date
+    moved[0].stations.append(later)
+    moved.write(str(tmp_path / "moved.xml"), "STATIONXML")
+    options = ("--ais", record / "ais.csv", "--end", "2013-05-21T10:30:00Z", "--detector", "analytic")
+    folders = [
+        tracked(record / "waveforms.mseed", *options, station=station, command="detect")
+        for station in (record / "station.xml", tmp_path / "moved.xml")
+    ]
+    (expected, rows), (found, same) = ((read_run(folder), detections(folder)) for folder in folders)
+    assert found.station == expected.station
+    pd.testing.assert_frame_equal(same, rows)
+
+
+def test_ships_are_those_about_the_place_of_the_record(inventory, record, tmp_path):
+    moved = copy.deepcopy(inventory)
+    later = copy.deepcopy(moved[0][0])
+    later.latitude, later.start_date = -45.0, START + 86400 * 365
+    moved[0].stations.append(later)
+    station = Station.from_stationxml(moved)
+    assert station.latitude == -45.0
+    here = commands.placed(station, [str(record / "waveforms.mseed")], RunConfig(), None, None)
+    assert here.latitude == inventory[0][0].latitude
+    assert len(commands.read_reference(record / "ais.csv", here)) == 1
+
+
 def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_path):
     """In slower water a delay is heard from farther off; run.json names the table, and the run reads it back."""
     from obsnet.ocean.rays import propagation_table, write_propagation
     from obsnet.ocean.sound_speed import OceanConfig
-    from obsnet.run import read_run
 
     run = read_run(finished)
     slower = propagation_table(OceanConfig(profile="constant", sound_speed_mps=1450.0), run.station.depth_m)

@@ -203,6 +203,7 @@ def calibrate_waveforms(
                 done = to_posix(block["time"].values[-1]) - source.begin_ns / 1e9
                 progress(float(done), (source.end_ns - source.begin_ns) / 1e9)
 
+    station = source.station
     return calibrate(blocks(), station, tracks, propagation_table(settings.ocean, station.depth_m), config)
 
 
