@@ -102,3 +102,17 @@ def test_no_minute_depends_on_how_the_record_is_cut_or_stopped(record, station, 
     maps = [np.concatenate([m.maps["azimuth_llr"].values for m in made]) for made in (expected, got)]
     assert two_sided(maps[0]).sum() > 15
     np.testing.assert_allclose(*maps, atol=1e-3)
+
+
+@pytest.mark.parametrize("detector", ["analytic", "learned"])
+def test_a_hydrophone_without_a_number_is_as_none(stream, station, detector):
+    """As `Stream.merge(fill_value=nan)` leaves one that never recorded."""
+    broken = stream.copy()
+    for trace in broken.select(channel="BDH"):
+        trace.data = np.full(trace.stats.npts, np.nan, np.float32)
+    run = obsnet.detect(broken, station, RunConfig(detector=detector), endtime=CPA)
+    alone = obsnet.detect(stream, station.without("XX.SIM01.00.BDH"), RunConfig(detector=detector), endtime=CPA)
+    assert run.maps["azimuth"].attrs["ambiguity_deg"] == 180
+    assert run.detections["azimuth_deg"].notna().any()
+    pd.testing.assert_frame_equal(run.detections, alone.detections)
+    assert "never works" in run.info["waveforms"]["left_aside"]["XX.SIM01.00.BDH"]

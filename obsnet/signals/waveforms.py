@@ -32,7 +32,10 @@ _CHECKED_S = 60.0
 
 @dataclass
 class ChannelReport:
-    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last four."""
+    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last four.
+
+    Frames are dead where samples stand still or are no numbers.
+    """
 
     sampling_rate: float
     starttime: str
