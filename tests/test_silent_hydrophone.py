@@ -111,7 +111,9 @@ def test_a_hydrophone_without_a_number_is_as_none(stream, station, detector):
     for trace in broken.select(channel="BDH"):
         trace.data = np.full(trace.stats.npts, np.nan, np.float32)
     run = obsnet.detect(broken, station, RunConfig(detector=detector), endtime=CPA)
-    alone = obsnet.detect(stream, station.without("XX.SIM01.00.BDH"), RunConfig(detector=detector), endtime=CPA)
+    alone = obsnet.detect(
+        stream, station.without("XX.SIM01.00.BDH"), RunConfig(detector=detector), endtime=CPA
+    )
     assert run.maps["azimuth"].attrs["ambiguity_deg"] == 180
     assert run.detections["azimuth_deg"].notna().any()
     pd.testing.assert_frame_equal(run.detections, alone.detections)
