@@ -184,7 +184,7 @@ def serve(folder: Path, host: str, port: int, ais: Path | None) -> None:
         folder,
         host,
         port,
-        None if ais is None else (lambda at: reference_tracks(read(ais), at)),
+        None if ais is None else (lambda at: reference_tracks(read(ais, near=at), at)),
         ready,
     )
 
@@ -263,7 +263,7 @@ def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3,
     """Reference tracks of an AIS file, around the station; says which rows were dropped, unless quiet."""
     from obsnet.ais import read, reference_tracks
 
-    positions = read(path)
+    positions = read(path, near=(station.latitude, station.longitude))
     for complaint in positions.attrs["report"].complaint():
         if not quiet:
             console.say(f"note: {complaint}")

@@ -14,6 +14,7 @@ from pyproj import Geod
 from threadpoolctl import threadpool_info
 
 from obsnet import Station, commands, detect, netcdf
+from obsnet.errors import AISError
 from obsnet.kinematics import StraightCourse
 from obsnet.pipeline import RunConfig
 from obsnet.run import read_run
@@ -283,6 +284,21 @@ def test_ships_are_those_about_the_place_of_the_record(inventory, record, tmp_pa
     here = commands.placed(station, [str(record / "waveforms.mseed")], RunConfig(), None, None)
     assert here.latitude == inventory[0][0].latitude
     assert len(commands.read_reference(record / "ais.csv", here)) == 1
+
+
+def test_of_an_ais_file_the_surroundings_are_held_alone(record, inventory, tmp_path, monkeypatch):
+    """A national archive would not fit."""
+    held = []
+    monkeypatch.setattr("obsnet.ais.reference_tracks", lambda ais, *place, **limits: held.append(ais) or [])
+    near = pd.read_csv(record / "ais.csv")
+    far = near.assign(lat=near["lat"] + 30.0, mmsi=near["mmsi"] + 1)
+    pd.concat([near, far]).to_csv(tmp_path / "both.csv", index=False)
+    far.to_csv(tmp_path / "far.csv", index=False)
+    station = Station.from_stationxml(inventory)
+    commands.read_reference(tmp_path / "both.csv", station)
+    assert set(held[0]["mmsi"]) == set(near["mmsi"])
+    with pytest.raises(AISError, match="too far away"):
+        commands.read_reference(tmp_path / "far.csv", station)
 
 
 def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_path):
