@@ -6,8 +6,9 @@ import importlib.util
 import json
 from collections.abc import Generator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsnet import console
 from obsnet.beside import Beside
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from obsnet.pipeline import RunConfig
     from obsnet.run import Run
     from obsnet.signals.station import Station
+
+Settings = TypeVar("Settings", bound="RunConfig")
 
 
 def track(
@@ -51,8 +54,8 @@ def track(
         from obsnet.output import staged
 
     settings = run_config(config, overrides, detector, tracker, propagation)
-    station, amplitudes = _calibrated(
-        station_file, code, start, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+    station, settings, amplitudes = _calibrated(
+        station_file, code, start, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     if ais:
@@ -115,8 +118,8 @@ def watch(
         if isinstance(section, dict):
             section["latency_s"] = latency
     settings = build(WatchConfig, values)
-    station, amplitudes = _calibrated(
-        station_file, code, None, calibration, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+    station, settings, amplitudes = _calibrated(
+        station_file, code, None, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     watch_source(
@@ -247,16 +250,22 @@ def placed(
 
 
 def _calibrated(
-    path: Path, code: str | None, start: str | None, calibration: Path | None, **overrides: Any
-) -> tuple[Station, Amplitudes | None]:
-    """Station and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given."""
+    path: Path,
+    code: str | None,
+    start: str | None,
+    calibration: Path | None,
+    config: Settings,
+    **overrides: Any,
+) -> tuple[Station, Settings, Amplitudes | None]:
+    """Station, parameters and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given."""
     station = read_station(path, code, start, **overrides)
     if calibration is None:
-        return station, None
+        return station, config, None
     from obsnet.calibration import Calibration
 
     fitted = Calibration.read(calibration)
-    return fitted.apply(station), fitted.amplitudes
+    config = replace(config, ocean=fitted.ocean(config.ocean))
+    return fitted.apply(station), config, fitted.amplitudes
 
 
 def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3, quiet: bool = False) -> list:

@@ -100,6 +100,12 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.azimuth.step_s != self.range.step_s or self.azimuth.window_s != self.range.window_s:
             raise ConfigError("azimuth and range detectors must share window_s and step_s")
+        tile, step, window = self.grid_search.tile_s, self.azimuth.step_s, self.azimuth.window_s
+        if abs(tile / step - round(tile / step)) > 1e-9 or tile < window:
+            raise ConfigError(
+                f"grid_search.tile_s must be a multiple of step_s and no shorter than window_s, "
+                f"found {tile:g} s for {step:g} and {window:g} s"
+            )
         hints = get_type_hints(RunConfig)
         for name in ("detector", "tracker"):
             if getattr(self, name) not in get_args(hints[name]):

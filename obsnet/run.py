@@ -293,16 +293,19 @@ def segment_tracks(
     new = search(run.maps, segment, delay, run.config.grid_search, threads, near, ghosts)
     if not new and not near and not _range_heard(run, segment):
         new = _by_bearings(run, segment, delay)
-    return [
-        replace(t, method=f"{t.method}; course ambiguous by 180°") if _two_sided(run, t) else t for t in new
-    ]
+    return [_said_ambiguous(found) if _two_sided(run, found) else found for found in new]
+
+
+def _said_ambiguous(track: Track) -> Track:
+    method = f"{track.method}; course ambiguous by 180°"
+    return replace(track, method=method, extra=track.extra | {"ambiguity_deg": 180.0})
 
 
 def _two_sided(run: Run, track: Track) -> bool:
     """Whether none of a track's minutes with an azimuth tells it from the opposite one."""
     if "azimuth_llr" not in run.maps:
         return False
-    if run.maps["azimuth"].attrs.get("ambiguity_deg", 360) == 180:
+    if _ambiguity_deg(run) == 180:
         return True
     times = to_posix(run.maps["time"].values)
     said = (
@@ -314,11 +317,16 @@ def _two_sided(run: Run, track: Track) -> bool:
     return bool(len(said) and two_sided(said).all())
 
 
+def _ambiguity_deg(run: Run) -> int:
+    """180 where no azimuth of the run is told from its opposite, else 360."""
+    return int(run.maps["azimuth"].attrs.get("ambiguity_deg", 360)) if "azimuth" in run.maps else 360
+
+
 def _followed(run: Run) -> list[Segment]:
     """Segments in which the Bernoulli filter, minute by minute, holds a ship for sure (existence over 0.9)."""
     from obsnet.trackers.bernoulli import track_azimuth
 
-    if "azimuth_llr" not in run.maps or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
+    if "azimuth_llr" not in run.maps or _ambiguity_deg(run) != 360:
         raise ConfigError(NEEDS_FULL_AZIMUTHS)
     times = to_posix(run.maps["time"].values)
     held = track_azimuth(times, known_sides(run.maps["azimuth_llr"].values), run.maps["azimuth"].values)
@@ -399,6 +407,8 @@ def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
             for s in run.segments
         ],
         "tracks": len(run.tracks),
+        "azimuth_ambiguity_deg": _ambiguity_deg(run),
+        "ambiguous_tracks": [n for n, found in enumerate(run.tracks, 1) if found.ambiguity_deg == 180],
         "notes": _notes(run),
         "seconds": {stage: round(value, 3) for stage, value in clock.stages.items()},
         "peak_memory_mb": provenance.peak_memory_mb(),
@@ -406,16 +416,36 @@ def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
 
 
 def _notes(run: Run) -> list[str]:
-    notes = []
+    notes = _unused(run.config) if "azimuth_llr" in run.maps else []
     if len(run.presence) and "azimuth" not in run.presence:
         notes.append("no two horizontals: range only, courses are not observed")
     if len(run.presence) and "range" not in run.presence:
         notes.append("no hydrophone: azimuth from polarisation, ambiguous by 180°, no range")
+    elif _ambiguity_deg(run) == 180:
+        notes.append("azimuth from polarisation, ambiguous by 180°")
     elif "azimuth_llr" in run.maps and (alone := two_sided(run.maps["azimuth_llr"].values).sum()):
         notes.append(
             f"the hydrophone is silent in {alone} minutes: their azimuths are from polarisation, known on which axis but not to which side"
         )
     return notes
+
+
+def _unused(config: RunConfig) -> list[str]:
+    """A note where parameters were given that the detector asked for does not take."""
+    if config.detector not in ("learned", "learned-azimuth"):
+        return []
+    from obsnet.detectors.learned import UNUSED
+
+    default = RunConfig()
+    given = [
+        f"{section}.{name}"
+        for section, names in UNUSED.items()
+        for name in names
+        if getattr(getattr(config, section), name) != getattr(getattr(default, section), name)
+    ]
+    return (
+        [f"{', '.join(given)}: of the analytic azimuth detector, the learned one takes none"] if given else []
+    )
 
 
 def read_run(folder: str | Path) -> Run:

@@ -242,6 +242,10 @@ def test_a_span_in_a_gap(refused, stream, tmp_path):
         ("range: {pairs: 1-3}", "range.pairs must be a list"),
         ("range: {pairs: [1-2]}", "no amplitude is known of the pairs 1-2"),
         ("azimuth: {step_s: 30}", "must share window_s and step_s"),
+        (
+            "{azimuth: {window_s: 300}, range: {window_s: 300}, detector: analytic}",
+            "tile_s must be a multiple of step_s",
+        ),
         ("detector: magic", "detector must be one of learned, analytic"),
         ("- a\n- b", "must hold a mapping of keys, found a list"),
         ("just text", "must hold a mapping of keys, found a str"),

@@ -275,6 +275,9 @@ def test_a_track_known_up_to_half_a_turn_is_its_ships_on_either_side():
     found = evaluate(*given, DetectionCriteria(azimuth_period_deg=180.0))
     assert found.missed == () and found.false_tracks == ()
     assert abs(found.ships[0].course_error_deg) < 0.5 and abs(found.ships[0].cpa_azimuth_error_deg) < 0.5
+    marked = given[1].assign(ambiguity_deg=180.0)
+    assert evaluate(given[0], marked, *given[2:]).missed == ()
+    assert evaluate(given[0], marked.assign(ambiguity_deg=360.0), *given[2:]).missed == (1,)
     # Going the other way past the same place is no turn about the station.
     reverse = tracks(FIRST).assign(course_deg=FIRST.course_deg + 90.0)
     half = DetectionCriteria(azimuth_period_deg=180.0)

@@ -1,5 +1,7 @@
 """A hydrophone that stops working costs the range and the azimuth's side, not the azimuth."""
 
+from dataclasses import replace
+
 import numpy as np
 import obspy
 import pandas as pd
@@ -11,6 +13,7 @@ from obsnet.experiments.ablation_minutes import minute_table
 from obsnet.kinematics import wrap180
 from obsnet.layout import to_posix
 from obsnet.pipeline import Pipeline, RunConfig
+from obsnet.signals.azigram import AzigramConfig
 from obsnet.signals.spectra import SpectraConfig, iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
@@ -75,7 +78,7 @@ def test_the_ship_is_tracked_once_and_past_the_fault(runs):
     assert track.end > CPA.timestamp + 600.0
     assert abs(track.motion.cpa_time - expected.motion.cpa_time) < 60.0
     assert abs(wrap180(track.motion.course_deg - expected.motion.course_deg)) < 3.0
-    assert "ambiguous" not in track.method
+    assert "ambiguous" not in track.method and broken.info["ambiguous_tracks"] == []
 
 
 @pytest.mark.parametrize("detector", ["analytic", "learned"])
@@ -118,3 +121,26 @@ def test_a_hydrophone_without_a_number_is_as_none(stream, station, detector):
     assert run.detections["azimuth_deg"].notna().any()
     pd.testing.assert_frame_equal(run.detections, alone.detections)
     assert "never works" in run.info["waveforms"]["left_aside"]["XX.SIM01.00.BDH"]
+
+
+@pytest.mark.parametrize("detector", ["analytic", "learned"])
+def test_polarisation_is_what_the_horizontals_alone_say_where_it_is_asked_for(stream, station, detector):
+    end = CPA
+    asked = RunConfig(detector=detector, azigram=AzigramConfig(method="polarisation"))
+    told = obsnet.detect(stream, station, asked, endtime=end)
+    alone = obspy.Stream([trace for trace in stream if trace.stats.channel != "BDH"])
+    expected = obsnet.detect(alone, station, RunConfig(detector=detector), endtime=end)
+    assert told.maps["azimuth"].attrs["ambiguity_deg"] == 180 == told.info["azimuth_ambiguity_deg"]
+    assert "range_llr" in told.maps and "range_llr" not in expected.maps
+    assert told.info["notes"] == ["azimuth from polarisation, ambiguous by 180°"]
+    said, wanted = (run.maps["azimuth_llr"].values for run in (told, expected))
+    assert np.isfinite(said).any() and np.allclose(said, wanted, atol=1e-4, equal_nan=True)
+
+
+def test_parameters_that_the_learned_detector_does_not_take_are_said(stream, station):
+    begin, asked = CPA - 3600.0, RunConfig(azigram=AzigramConfig(fmin_hz=8.0))
+    learned = obsnet.detect(stream, station, asked, starttime=begin, endtime=begin + 900.0)
+    assert any(note.startswith("azigram.fmin_hz:") for note in learned.info["notes"])
+    analytic = replace(asked, detector="analytic")
+    analytic = obsnet.detect(stream, station, analytic, starttime=begin, endtime=begin + 900.0)
+    assert not any("azigram" in note for note in analytic.info["notes"])

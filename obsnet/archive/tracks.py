@@ -12,7 +12,6 @@ import time
 import traceback
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -57,10 +56,11 @@ class TracksTask:
 
 def tracks_tasks(ledger: Ledger, config: RunConfig, code: str, dates: Iterable[str]) -> list[TracksTask]:
     """What is to be tracked at a station whose finished days are `dates`, in order of time."""
-    found: list[Segment] = []
-    for stretch in _stretches(sorted(dates)):
-        rows = _minutes(ledger, [Day(code, date) for date in stretch])
-        found += segments(_presence(rows), config.segmentation)
+    days = [Day(code, date) for date in sorted(dates)]
+    if not days:
+        return []
+    rows = _minutes(ledger, days)
+    found = segments(_presence(rows), config.segmentation)
     groups: dict[str, list[Segment]] = {}
     begun, until = "", -np.inf
     for segment in found:
@@ -170,10 +170,3 @@ def _minutes(ledger: Ledger, days: list[Day]) -> pd.DataFrame:
 def _presence(rows: pd.DataFrame) -> pd.DataFrame:
     ratios = rows.set_index(to_posix(rows["time"].to_numpy()))[list(_PRESENCE)].rename(columns=_PRESENCE)
     return ratios.dropna(axis=1, how="all")
-
-
-def _stretches(dates: list[str]) -> list[list[str]]:
-    """Runs of consecutive days: after a day without results the record begins anew, as in one run."""
-    ordinals = [int(np.datetime64(date, "D").astype(int)) for date in dates]
-    cuts = [i + 1 for i, (before, after) in enumerate(pairwise(ordinals)) if after != before + 1]
-    return [dates[lo:hi] for lo, hi in pairwise([0, *cuts, len(dates)]) if hi > lo]

@@ -1,8 +1,8 @@
 """A station calibrated by ships whose AIS is known: orientation, hydrophone polarity, position, path
-amplitudes.
+amplitudes, and how late the sea floor's echo is.
 
 Spectra and reference tracks in, a `Calibration` out, which writes the file that tracking takes. The station's
-clock and depth are taken as they are.
+clock is taken as it is.
 
 Source: Trabattoni et al. 2019 (orientation and position from ship noise); Trabattoni et al. 2023, JASA 153,
 260, doi:10.1121/10.0016810, appendices C and D (amplitudes).
@@ -11,16 +11,17 @@ Source: Trabattoni et al. 2019 (orientation and position from ship noise); Traba
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
+from obsnet.calibration.echo import echo_delay
 from obsnet.calibration.envelope import Branches, fit, locate, stack
 from obsnet.calibration.orientation import Rotation, downward_flux, rotation
 from obsnet.calibration.passages import Passages, gather
-from obsnet.calibration.result import Calibration, Orientation, Polarity, Position, moved
+from obsnet.calibration.result import Calibration, Echo, Orientation, Polarity, Position, moved
 from obsnet.errors import ConfigError
 from obsnet.layout import to_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Calibration",
     "CalibrationConfig",
+    "Echo",
     "Orientation",
     "Polarity",
     "Position",
@@ -62,6 +64,7 @@ class CalibrationConfig:
         `amplitude_range_m`.
     isolation : frames in which the second nearest ship is not this many times as far are left out.
     search_m, search_step_m : half-width and step of the search for the station's position.
+    echo_delay_s : least and greatest delay of the sea floor's echo at vertical incidence; equal for none.
     pairs : path pairs. bin_m : bin of range for the amplitudes.
     """
 
@@ -75,6 +78,7 @@ class CalibrationConfig:
     isolation: float = 2.0
     search_m: float = 1500.0
     search_step_m: float = 100.0
+    echo_delay_s: tuple[float, float] = (-0.1, 0.4)
     pairs: tuple[str, ...] = ("1-3", "3-5", "5-7", "7-9", "9-11")
     bin_m: float = 1000.0
     clutter: CepstrogramConfig = field(default_factory=CepstrogramConfig)
@@ -91,6 +95,8 @@ class CalibrationConfig:
         for name in ("average_s", "bin_m", "amplitude_range_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be > 0, found {getattr(self, name):g}")
+        if not -1.0 <= self.echo_delay_s[0] <= self.echo_delay_s[1] <= 1.0:
+            raise ConfigError(f"echo_delay_s must increase within [-1, 1] s, found {self.echo_delay_s}")
         if not self.isolation >= 1:
             raise ConfigError(f"isolation must be >= 1, found {self.isolation:g}")
         if not self.pairs:
@@ -139,6 +145,10 @@ def calibrate(
     notes: list[str] = []
     expected = Amplitudes.default().scaled_to(station.depth_m)
     branches = Branches(passages, table, tuple(pair for pair in config.pairs if pair in expected.pairs))
+    echo = echo_delay(branches, expected, config.echo_delay_s, config.search_m, config.search_step_m)
+    if echo:
+        branches = branches.late(echo.delay_s)
+        echo = replace(echo, delay_s=table.attrs.get("echo_delay_s", 0.0) + echo.delay_s)
     place, turned = _place_and_turn(station, passages, branches, expected, config, notes)
     shift = (place.east_m, place.north_m) if place else (0.0, 0.0)
     polarity = _polarity(station, downward_flux(passages), notes)
@@ -155,6 +165,7 @@ def calibrate(
         heard,
         tuple(notes),
         turned.by_frequency if turned else (),
+        echo,
         stacked,
     )
 

@@ -4,6 +4,7 @@ interfere.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.optimize import least_squares
 
 from obsnet.calibration.passages import Passages, vertex
 from obsnet.ocean.amplitudes import Amplitudes, SkewNormal
-from obsnet.ocean.rays import parse_pair, tdoa, travel_time
+from obsnet.ocean.rays import delay_echoes, parse_pair, tdoa, travel_time
 from obsnet.signals.cepstrogram import noise_std
 
 BLOCK_S = 1200.0
@@ -66,6 +67,11 @@ class Branches:
         self.pairs = tuple(
             pair for pair in pairs if set(parse_pair(pair)) <= set(table["path"].values.tolist())
         )
+        self._along(table)
+
+    def _along(self, table: xr.Dataset) -> None:
+        """Take pairs' delays from this table."""
+        self.table = table
         self.range_m = table["range"].values.astype(float)
         self.delay = np.stack([tdoa(table, pair).values for pair in self.pairs])
         told = self.delay.copy()
@@ -75,6 +81,12 @@ class Branches:
         self.east_m, self.north_m = self._emitted(table)
         # The first 0.3 s hold the source's own spectrum, the clutter filter notwithstanding.
         self.delay[self.delay < 0.3] = np.nan
+
+    def late(self, echo_delay_s: float) -> Branches:
+        """The same cepstra along the delays of a sea floor whose echo comes this much later [s]."""
+        other = copy.copy(self)
+        other._along(delay_echoes(self.table, echo_delay_s))
+        return other
 
     def _emitted(self, table: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         """East and north [m] of the ship at t − (τ_i + τ_j)/2, for each pair and frame."""
@@ -107,10 +119,32 @@ class Branches:
         ]
         return np.where(inside, value, np.nan)
 
+    def weights(self, amplitudes: Amplitudes) -> np.ndarray:
+        """Weight a_ij(r)²/σ² of each pair and frame in the score of an offset."""
+        rows = [
+            amplitudes.evaluate(pair, self.ranges(i)) ** 2 / self.variance(i, self.ranges(i))
+            for i, pair in enumerate(self.pairs)
+        ]
+        return np.stack(rows)
+
     def variance(self, pair: int, range_m: np.ndarray) -> np.ndarray:
         """Cepstral noise variance σ² at a pair's delay for the ranges [m]."""
         delay = np.interp(range_m, self.range_m, np.nan_to_num(self.delay[pair]))
         return np.interp(delay, self.step * np.arange(self.std.size), self.std) ** 2
+
+
+def scan(branches: Branches, weights: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Score of each offset east and north in `grid` [m], over all frames, of the blurred envelope."""
+    blurred = gaussian_filter1d(np.minimum(branches.excess, CLIP), BLUR, axis=1)
+    return score_offsets(branches, blurred, weights, grid, grid, np.zeros(branches.heard.time.size, int))[0]
+
+
+def scan_noise(weights: np.ndarray) -> float:
+    """Standard deviation of a `scan`'s scores where there is noise alone.
+
+    |Ĉ/σ|² has variance 4, frames overlap by half, and the blur averages neighbours.
+    """
+    return float(np.sqrt(2.0 * 4.0 * np.nansum(weights**2) / (2.0 * BLUR * np.sqrt(np.pi))))
 
 
 def locate(branches: Branches, amplitudes: Amplitudes, search_m: float, step_m: float) -> list[Offset]:
@@ -129,18 +163,11 @@ def locate(branches: Branches, amplitudes: Amplitudes, search_m: float, step_m: 
     """
     if branches.heard.time.size < MIN_FRAMES:
         return []
-    weights = np.stack(
-        [
-            amplitudes.evaluate(pair, branches.ranges(i)) ** 2 / branches.variance(i, branches.ranges(i))
-            for i, pair in enumerate(branches.pairs)
-        ]
-    )
-    blurred = gaussian_filter1d(np.minimum(branches.excess, CLIP), BLUR, axis=1)
+    weights = branches.weights(amplitudes)
     grid = np.arange(-search_m, search_m + step_m / 2, step_m)
-    scores = _scores(branches, blurred, weights, grid, grid, np.zeros(branches.heard.time.size, int))[0]
+    scores = scan(branches, weights, grid)
     scores -= np.median(scores)
-    # |Ĉ/σ|² has variance 4, frames overlap by half, and the blur averages neighbours.
-    noise = float(np.sqrt(2.0 * 4.0 * np.nansum(weights**2) / (2.0 * BLUR * np.sqrt(np.pi))))
+    noise = scan_noise(weights)
     peaks = (scores == maximum_filter(scores, 7)) & (scores > max(SIGNIFICANCE * noise, RIVAL * scores.max()))
     best = np.unravel_index(scores.argmax(), scores.shape)
     if not peaks[best] or min(best) == 0 or max(best) == grid.size - 1:
@@ -161,7 +188,7 @@ def _refine(
     for reach in (1.5 * step_m, 4.5 * step_m):
         around = np.linspace(-reach, reach, 2 * 9 + 1)
         east, north = start[0] + around, start[1] + around
-        parts = _scores(branches, excess, weights, east, north, blocks)
+        parts = score_offsets(branches, excess, weights, east, north, blocks)
         parts = gaussian_filter1d(gaussian_filter1d(parts, 1.0, axis=1), 1.0, axis=2)
         total = parts.sum(axis=0)
         left_out = np.array([_peak(total - part, east, north) for part in parts])
@@ -275,7 +302,7 @@ def _fit_pair(range_m: np.ndarray, square: np.ndarray, error: np.ndarray, start:
     return curve(min(fits, key=lambda found: found.cost).x)
 
 
-def _scores(
+def score_offsets(
     branches: Branches,
     excess: np.ndarray,
     weights: np.ndarray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from pyproj import Geod
 from obsnet.config import build, read_yaml
 from obsnet.errors import ConfigError, OutputError, StationError
 from obsnet.ocean.amplitudes import Amplitudes
+from obsnet.ocean.sound_speed import OceanConfig
 from obsnet.signals.station import Station
 
 
@@ -58,11 +59,22 @@ class Position:
 
 
 @dataclass(frozen=True)
+class Echo:
+    """How late the sea floor's echo comes at vertical incidence, beyond the water's depth, and its standard
+    deviation [s].
+    """
+
+    delay_s: float
+    std_s: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Orientation, polarity, position and path amplitudes of a station, from AIS passages.
 
     A part that the passages did not determine is None, and `notes` says why; `apply` leaves it as the
-    metadata have it. `fitted_pairs` are those of `amplitudes` that were heard; the others are the paper's,
+    metadata have it. `echo` is None where echoes come when the water's depth says, or nothing tells.
+    `fitted_pairs` are those of `amplitudes` that were heard; the others are the paper's,
     scaled to the depth. `stack` holds the stacked cepstral amplitudes, for plots; it is not written.
     """
 
@@ -75,6 +87,7 @@ class Calibration:
     fitted_pairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     orientation_by_frequency: tuple[tuple[float, float, int], ...] = ()
+    echo: Echo | None = None
     stack: xr.Dataset | None = field(default=None, compare=False, repr=False)
 
     def apply(self, station: Station) -> Station:
@@ -97,6 +110,10 @@ class Calibration:
             longitude=position.longitude if position else None,
         )
 
+    def ocean(self, config: OceanConfig) -> OceanConfig:
+        """The ocean as calibrated: with the sea floor's echo as late as it was found to be."""
+        return replace(config, echo_delay_s=self.echo.delay_s) if self.echo else config
+
     def table(self) -> str:
         """Plain text for people."""
         plural = "" if self.passages == 1 else "s"
@@ -116,6 +133,10 @@ class Calibration:
                 f"{at.north_m:+.0f} ± {at.north_std_m:.0f} m",
             )
             lines.append(f"  offset            {east} east, {north} north")
+        if self.echo:
+            lines.append(
+                f"  echo of the floor {1e3 * self.echo.delay_s:+.0f} ± {1e3 * self.echo.std_s:.0f} ms"
+            )
         for pair, curve in self.amplitudes.curves.items():
             source = "measured" if pair in self.fitted_pairs else "not heard, scaled from the paper"
             lines.append(
@@ -126,7 +147,7 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain mapping, ready for YAML or JSON."""
-        parts = {name: getattr(self, name) for name in ("orientation", "polarity", "position")}
+        parts = {name: getattr(self, name) for name in ("orientation", "polarity", "position", "echo")}
         return {
             "station": self.station,
             "passages": self.passages,
@@ -179,6 +200,7 @@ class Calibration:
                 tuple(map(str, values.get("fitted_pairs", ()))),
                 tuple(map(str, values.get("notes", ()))),
                 tuple((float(f), float(a), int(n)) for f, a, n in values.get("orientation_by_frequency", ())),
+                build(Echo, values["echo"], "echo") if values.get("echo") else None,
             )
         except KeyError as error:
             raise ConfigError(f"{path} is not a calibration: it lacks {error.args[0]}") from None

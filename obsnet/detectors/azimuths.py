@@ -55,7 +55,8 @@ class Azimuths:
             return
         azimuths = azigram(spectra, self._estimator)
         if self.learned is not None:
-            self.learned.take(spectra)
+            axes = self._estimator.method == "polarisation"
+            self.learned.take(spectra[sorted(HORIZONTALS)] if axes else spectra)
         elif self._detector.null == "directional":
             null = self._background(azimuths)
             self._null = null if self._null is None else np.concatenate([self._null, null], axis=1)

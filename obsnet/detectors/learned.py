@@ -24,6 +24,19 @@ from obsnet.errors import ModelError
 from obsnet.signals.spectra import SpectraConfig
 
 WINDOW_S, STEP_S = 180.0, 60.0
+UNUSED = {
+    "azigram": ("fmin_hz", "fmax_hz", "average_frames"),
+    "azimuth": (
+        "mean_resultant_length",
+        "mode",
+        "frequency_overlap_exponent",
+        "null",
+        "background_window_s",
+        "background_step_s",
+        "background_prior_s",
+    ),
+}
+"""Parameters by section that are the analytic detector's alone; the network has learned what they say."""
 
 
 def without_floor(llr: np.ndarray) -> np.ndarray:

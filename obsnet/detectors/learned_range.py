@@ -267,6 +267,14 @@ def _check_fits(
             f"the range model was trained on windows of {features.window_s:g} s, found {config.window_s:g} s; "
             "use --detector analytic"
         )
+    for name, wanted, grid in (
+        ("max_range_m", config.max_range_m, features.range_m[-1]),
+        ("max_range_rate_mps", config.max_range_rate_mps, features.range_rate[-1]),
+    ):
+        if wanted > 1.1 * grid:
+            raise ModelError(
+                f"the range model knows nothing beyond {name} {grid:g}, found {wanted:g}; lower it or use --detector analytic"
+            )
     for name in ("window_s", "hop_s", "analysis_rate_hz"):
         trained = card.representation["spectra"][name]
         if getattr(spectra, name) != trained:

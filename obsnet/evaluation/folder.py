@@ -52,7 +52,8 @@ def evaluate_folder(
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
         place = station["latitude"], station["longitude"]
         delay = _delay_of_run(info["config"], station["depth_m"])
-        notes = info.get("notes", [])
+        ambiguous = info.get("azimuth_ambiguity_deg", 360) == 180
+        half_known = tracks["track"].isin(info.get("ambiguous_tracks", []))
     except (KeyError, TypeError, ValueError) as error:
         raise LayoutError(
             f"{folder}/run.json does not describe a run of obsnet ({error}); run obsnet track again"
@@ -66,7 +67,7 @@ def evaluate_folder(
         merchants = [track for track in ais if is_merchant(track.attributes.get("ship_type"))]
         said += _left_out([track for track in ais if track not in merchants], detections, max_cpa_m)
         ais = merchants
-    ambiguous = any("180°" in str(note) for note in notes)
+    tracks = tracks.assign(ambiguity_deg=half_known.map({True: 180.0, False: 360.0}))
     criteria = DetectionCriteria(azimuth_period_deg=180.0 if ambiguous else 360.0)
     found = evaluate(detections, tracks, ais, delay, criteria, expected_cpa_m=max_cpa_m)
     return replace(found, notes=(*said, *found.notes))

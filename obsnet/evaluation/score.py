@@ -54,7 +54,8 @@ def evaluate(
     detections : DataFrame
         Columns of detections.csv: what was heard at each minute.
     tracks : DataFrame or sequence of Track
-        Columns of tracks.csv: where the ships were, the sound's travel time undone.
+        Columns of tracks.csv: where the ships were, the sound's travel time undone. Those whose `ambiguity_deg`, where there
+        is such a column, is 180 may lie on the other side of the station.
     reference : list of ReferenceTrack
         The ships. Those that the station did not hear within the record are left out.
     delay : function of range [m] giving the sound's travel time [s], optional
@@ -80,8 +81,8 @@ def evaluate(
         ]
     lines = [track.course_at_cpa() for track in reference]
     compared = compare(detections, reference, delay, criteria)
-    if criteria.azimuth_period_deg == 180.0:
-        tracks = turned_to(tracks, lines, gates)
+    half_known = tracks["ambiguity_deg"] == 180.0 if "ambiguity_deg" in tracks else False
+    tracks = turned_to(tracks, lines, gates, half_known | (criteria.azimuth_period_deg == 180.0))
     matches = match_tracks(tracks, lines, gates)
     nearest = np.inf if expected_cpa_m is None else expected_cpa_m
     ships = tuple(
@@ -187,7 +188,12 @@ def _track_table(tracks: pd.DataFrame | Sequence[Track]) -> pd.DataFrame:
     if isinstance(tracks, pd.DataFrame):
         return _checked(tracks, TRACKS, "tracks") if len(tracks) else pd.DataFrame(columns=list(TRACKS))
     rows = [
-        {**track.row(i), "covariance": track.covariance, "signed_cpa_m": track.motion.cpa_range_m}
+        {
+            **track.row(i),
+            "covariance": track.covariance,
+            "signed_cpa_m": track.motion.cpa_range_m,
+            "ambiguity_deg": track.ambiguity_deg,
+        }
         for i, track in enumerate(tracks, 1)
     ]
     return _checked(pd.DataFrame(rows), TRACKS, "tracks") if rows else pd.DataFrame(columns=list(TRACKS))

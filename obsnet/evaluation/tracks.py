@@ -58,16 +58,20 @@ def track_errors(tracks: pd.DataFrame, lines: list[StraightCourse]) -> np.ndarra
     return errors
 
 
-def turned_to(tracks: pd.DataFrame, lines: list[StraightCourse], gates: MatchGates) -> pd.DataFrame:
-    """Tracks known up to half a turn about the station, each on the side on which it comes nearer to a ship's straight course."""
-    if not len(tracks) or not lines:
+def turned_to(
+    tracks: pd.DataFrame, lines: list[StraightCourse], gates: MatchGates, half_known: pd.Series | bool
+) -> pd.DataFrame:
+    """Tracks, those known up to half a turn about the station on the side on which they come nearer to a ship's straight course."""
+    if not len(tracks) or not lines or not np.any(half_known):
         return tracks
     columns = [name for name in ("course_deg", "cpa_azimuth_deg") if name in tracks]
     other = tracks.assign(**{name: (tracks[name].to_numpy(float) + 180.0) % 360.0 for name in columns})
     as_is, opposite = (
         np.nansum(_scaled(side, lines, gates) ** 2, axis=2).min(axis=1) for side in (tracks, other)
     )
-    return tracks.where(pd.Series(as_is <= opposite, tracks.index), other)
+    return tracks.where(
+        pd.Series(as_is <= opposite, tracks.index) | ~pd.Series(half_known, tracks.index), other
+    )
 
 
 def _scaled(tracks: pd.DataFrame, lines: list[StraightCourse], gates: MatchGates) -> np.ndarray:

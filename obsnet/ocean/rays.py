@@ -143,12 +143,43 @@ def propagation(
 
 
 def propagation_table(config: OceanConfig, depth_m: float) -> xr.Dataset:
-    """Propagation table of a station: the user's own file where one is named, else by ray tracing."""
+    """Propagation table of a station: the user's own file where one is named, else by ray tracing.
+
+    Echoes are as late as `config.echo_delay_s` says.
+    """
     if config.propagation_file:
         table = read_propagation(config.propagation_file)
         table.attrs.setdefault("depth_m", float(depth_m))
-        return table
-    return propagation(config.sound_speed(), depth_m, config.bottom, config.ranges(), config.paths)
+    else:
+        table = propagation(config.sound_speed(), depth_m, config.bottom, config.ranges(), config.paths)
+    return delay_echoes(table, config.echo_delay_s) if config.echo_delay_s else table
+
+
+def delay_echoes(table: xr.Dataset, echo_delay_s: float) -> xr.Dataset:
+    """Propagation table of a sea floor whose echo comes later than that of the water's edge.
+
+    What a soft sediment lets through returns from a harder layer below it. With T the two-way vertical time
+    [s] to that layer and sound there as fast as in the water above (c), each of the (k − 1)/2 echoes of path
+    k adds T √(1 − p²c²), p being its slowness. Pressures are left as they are.
+    """
+    require(table, PROPAGATION)
+    speed = float(table.attrs.get("seafloor_speed_mps", 1500.0))
+    table = table.transpose("path", "range", ...)
+    echoes = (table["path"].values[:, None] - 1) // 2
+    steepness = np.sqrt(np.clip(1.0 - (table["slowness"].values * speed) ** 2, 0.0, None))
+    later = float(echo_delay_s) * echoes * steepness
+    slower = np.full(later.shape, np.nan)
+    for row, exists in enumerate(np.isfinite(later)):
+        if exists.sum() > 1:
+            slower[row, exists] = np.gradient(later[row, exists], table["range"].values[exists])
+    delays = {"delay": later, "slowness": slower}
+    moved = {
+        name: (table[name].dims, table[name].values + more, table[name].attrs)
+        for name, more in delays.items()
+    }
+    return table.assign(moved).assign_attrs(
+        echo_delay_s=table.attrs.get("echo_delay_s", 0.0) + float(echo_delay_s)
+    )
 
 
 def read_propagation(path: str | Path) -> xr.Dataset:

@@ -212,6 +212,8 @@ class OceanConfig:
         speed).
     propagation_file : netCDF propagation table of the user's own, instead of the ray tracer.
     bottom : elastic properties of the sea floor.
+    echo_delay_s : by how much its echo is late at vertical incidence, as from below a soft sediment (see
+        `delay_echoes`); ``obsnet calibrate`` finds it.
     max_range_m, range_step_m : of the table, m.
     paths : numbers of water-column crossings, odd.
     """
@@ -222,6 +224,7 @@ class OceanConfig:
     propagation_file: str | None = None
     munk: Munk = field(default_factory=Munk)
     bottom: Bottom = field(default_factory=Bottom)
+    echo_delay_s: float = 0.0
     max_range_m: float = 100_000.0
     range_step_m: float = 70.0
     paths: tuple[int, ...] = (1, 3, 5, 7, 9, 11)
@@ -245,6 +248,8 @@ class OceanConfig:
                 f"range_step_m must make at most {MOST_RANGES} ranges up to max_range_m ({self.max_range_m:g}), "
                 f"found {self.range_step_m:g}"
             )
+        if not -1.0 <= self.echo_delay_s <= 1.0:
+            raise ConfigError(f"echo_delay_s must lie in [-1, 1] s, found {self.echo_delay_s:g}")
         if self.table_file and self.profile != "table":
             raise ConfigError(f"table_file is for profile 'table', found profile {self.profile!r}")
 

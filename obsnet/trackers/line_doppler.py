@@ -36,6 +36,8 @@ SAME_SCALE = 0.13
 """Difference of two scales, in natural logarithms, up to which the range maps choose between them."""
 _BASE_HZ = 4.0
 """Lowest pitch looked at: below, a shift is less than a bin."""
+STEEPEST = 1e-3
+"""Slowness [s/m] of nothing in the sea: where travel time grows faster, the loudest path is another."""
 _MARGIN = 0.02
 """Greatest relative shift of a line, at the ends of the band."""
 
@@ -166,7 +168,7 @@ def doppler(point: np.ndarray, scales: np.ndarray, tiles: np.ndarray, delay: Del
     cpa_range, speed = abs(point[1]) * scales[:, None], point[3] * scales[:, None]
     emitted = delay.emitted(tiles - point[0], cpa_range, speed)
     distance = np.sqrt(cpa_range**2 + (speed * emitted) ** 2)
-    slowness = np.interp(
-        distance, delay.step_m * np.arange(len(delay.seconds)), np.gradient(delay.seconds, delay.step_m)
-    )
+    slowness = np.gradient(delay.seconds, delay.step_m)
+    grid, one_path = delay.step_m * np.arange(len(slowness)), np.abs(slowness) < STEEPEST
+    slowness = np.interp(distance, grid[one_path], slowness[one_path])
     return 1.0 / (1.0 + slowness * speed**2 * emitted / np.maximum(distance, 1.0))

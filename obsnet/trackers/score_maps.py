@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -159,23 +160,22 @@ def above_floor(
 
 
 def polyphase(rows: np.ndarray, step: float, course_step: float, courses: int) -> tuple[np.ndarray, float]:
-    """Azimuth rows laid out so that the courses of one hypothesis are neighbours in memory."""
-    if course_step < step:
-        finer = round(step / course_step)
-        count = rows.shape[1]
-        position = np.arange(count * finer) / finer
-        low = np.floor(position).astype(int)
+    """Azimuth rows laid out so that the courses of one hypothesis are neighbours in memory, and their step, deg.
+
+    Rows whose step does not divide that of the courses are read at the nearest finer one that does.
+    """
+    phases = max(1, math.ceil(course_step / step - 1e-6))
+    count = rows.shape[1]
+    bins = round(360.0 * phases / course_step)
+    if bins != count:
+        position = np.arange(bins) * (count / bins)
+        low = position.astype(int)
         mu = (position - low).astype(np.float32)
         rows = (1 - mu) * rows[:, low] + mu * rows[:, (low + 1) % count]
-        step = step / finer
-    phases = max(1, round(course_step / step))
-    bins = rows.shape[1]
-    if bins % phases:
-        phases = 1 if courses == 1 else phases
     wrapped = np.concatenate([rows, rows[:, np.arange(courses * phases) % bins]], axis=1)
     length = wrapped.shape[1] // phases
     laid = wrapped[:, : length * phases].reshape(len(rows), length, phases).transpose(0, 2, 1)
-    return np.ascontiguousarray(laid, dtype=np.float32), step
+    return np.ascontiguousarray(laid, dtype=np.float32), course_step / phases
 
 
 def _gaussian(count: int, std_bins: float, truncate: float, ends: Literal["wrap", "clip"]) -> np.ndarray:

@@ -11,7 +11,7 @@ from obsnet.errors import ConfigError
 class GridSearchConfig:
     """Prior, likelihood and levels of the grid search.
 
-    `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
+    `tile_s` is the time from one minute that is read to the next, so that their windows share no frames. `tile_bound` is the most that one tile may say (log-likelihood ratio; maps that say more are lowered, keeping their shape), `exponent` the power to which the whole likelihood is raised, `min_log_bayes_factor` what a track must reach against no ship
     and against a source whose azimuth drifts by `still_deg_per_hour` at most; a further ship beside or soon after a first must
     reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
     when no other is; where its CPA is located sharply, to two minutes and 500 m as remainders are not, no more than a first one. A track must be heard for

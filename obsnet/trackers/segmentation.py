@@ -57,7 +57,7 @@ def segments(
 
     Parameters
     ----------
-    presence : DataFrame indexed by s since 1970 (regular), with log presence ratios `azimuth`, `range`, and those of the range
+    presence : DataFrame indexed by s since 1970, in regular steps but for times that are left out, with log presence ratios `azimuth`, `range`, and those of the range
         detector for closing and opening range rates alone, `approaching` and `leaving`; NaN where there is no data. Columns
         of a detector that is not there are missing or all NaN.
     config : SegmentationConfig
@@ -65,10 +65,18 @@ def segments(
 
     Returns
     -------
-    list of Segment in time order, each at least `shortest_min` long; none begins or ends where there is no data.
+    list of Segment in time order, each at least `shortest_min` long; none begins or ends where there is no data, none reaches
+    over times that are left out.
 
     Source: Trabattoni et al. 2023, section III.D, eqs (24)–(25); the first factor of eq. (24) reads P_α.
     """
+    *before, last = _stretches(presence)
+    whole = [segment for stretch in before for segment in _segments(stretch, config, ended=True)]
+    return whole + _segments(last, config, ended)
+
+
+def _segments(presence: pd.DataFrame, config: SegmentationConfig, ended: bool) -> list[Segment]:
+    """Segments of one stretch in regular steps."""
     time = presence.index.to_numpy(float)
     if len(time) < 2:
         return []
@@ -95,11 +103,20 @@ def segments(
 
 def quiet_until(presence: pd.DataFrame, config: SegmentationConfig = SegmentationConfig()) -> float | None:
     """Last minute [s since 1970] without a ship that no later minute can change; segments to come start after it."""
-    if len(presence) < 2:
-        return None
-    heard, settled = _heard(presence, config)
+    *before, last = _stretches(presence)
+    ended = float(before[-1].index[-1]) if before else None
+    if len(last) < 2:
+        return ended
+    heard, settled = _heard(last, config)
     quiet = np.flatnonzero(~heard[:settled])
-    return float(presence.index[quiet[-1]]) if quiet.size else None
+    return float(last.index[quiet[-1]]) if quiet.size else ended
+
+
+def _stretches(presence: pd.DataFrame) -> list[pd.DataFrame]:
+    """Parts in regular steps, cut where times are left out as in a long silence; one, even if there is nothing."""
+    apart = np.diff(presence.index.to_numpy(float))
+    cuts = np.flatnonzero(apart > 1.5 * np.median(apart)) + 1 if apart.size else []
+    return [presence.iloc[first:last] for first, last in pairwise([0, *cuts, len(presence)])]
 
 
 def _heard(presence: pd.DataFrame, config: SegmentationConfig) -> tuple[np.ndarray, int]:

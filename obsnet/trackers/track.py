@@ -57,6 +57,11 @@ class Track:
     extra: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def ambiguity_deg(self) -> float:
+        """180 where the course may as well be its image through the station, 360 where it is known."""
+        return float(self.extra.get("ambiguity_deg", 360.0))
+
+    @property
     def std(self) -> np.ndarray:
         """Standard deviations over `PARAMETERS`."""
         return np.sqrt(np.diag(self.covariance))

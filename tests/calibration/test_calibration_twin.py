@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
+import obsnet
 from obsnet.ais import reference_tracks
 from obsnet.calibration import Calibration, calibrate, calibrate_waveforms
 from obsnet.calibration.result import moved
 from obsnet.kinematics import StraightCourse
 from obsnet.ocean.rays import propagation_table, travel_time
 from obsnet.ocean.sound_speed import OceanConfig
+from obsnet.run import RunConfig
 from obsnet.signals.azigram import azigram
 from obsnet.signals.spectra import spectra
 from obsnet.signals.station import Station
 from obsnet.twin.instrument import Recorder
+from obsnet.twin.scenario import MAX_RANGE_M
 from obsnet.twin.sea import Ambient
 from obsnet.twin.ship import Ship
 from obsnet.twin.station import Passage, Scenario, simulate
@@ -21,7 +24,7 @@ OFFSET = (350.0, -240.0)
 START = 1369130400.0
 
 
-def passage(seed, cpa_m, polarity, directed=0.3):
+def passage(seed, cpa_m, polarity, directed=0.3, ocean=OceanConfig(max_range_m=MAX_RANGE_M)):
     """Simulation of one ship, and the station as its metadata wrongly have it."""
     generator = np.random.default_rng(seed)
     recorder = Recorder.random(
@@ -33,6 +36,7 @@ def passage(seed, cpa_m, polarity, directed=0.3):
         hours=5.0,
         passages=(Passage(Ship.random(seed, source_level_db=194.0), course),),
         recorder=recorder,
+        ocean=ocean,
         ambient=Ambient(
             directional_fraction=directed, directional_azimuth_deg=float(generator.uniform(0, 360))
         ),
@@ -105,3 +109,18 @@ def test_without_horizontals_or_vertical_the_rest_is_still_found():
     assert found.position is not None
     assert any("horizontals" in note for note in found.notes)
     assert any("vertical" in note for note in found.notes)
+
+
+def test_a_floor_whose_echo_is_late_puts_ships_where_they_were_once_calibrated():
+    """A passage over a floor with a layer below it: tracks with the calibration, and without it."""
+    late = OceanConfig(max_range_m=MAX_RANGE_M, echo_delay_s=0.12)
+    simulation, station = passage(6, 9e3, 1, ocean=late)
+    found = calibrate_waveforms(simulation.stream, station, reference_tracks(simulation.ais, station))
+    assert found.echo.delay_s == pytest.approx(0.12, abs=3.0 * found.echo.std_s)
+    assert found.echo.std_s < 0.015
+    assert "ms" in found.table()
+    errors = {}
+    for name, config in (("with", RunConfig(ocean=found.ocean(OceanConfig()))), ("without", RunConfig())):
+        (track,) = obsnet.track(simulation.stream, found.apply(station), config).tracks
+        errors[name] = abs(track.motion.cpa_range_m - 9e3)
+    assert errors["with"] < 300.0 < errors["without"], errors

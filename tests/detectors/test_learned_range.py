@@ -8,7 +8,7 @@ from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import AnalyticRangeDetector, RangeDetectorConfig
 from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration, presence_ratio
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
-from obsnet.errors import ConfigError
+from obsnet.errors import ConfigError, ModelError
 from obsnet.layout import from_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.bottom import Bottom
@@ -130,6 +130,13 @@ def test_the_grids_are_those_of_the_configuration(table, cepstra):
     maps = LearnedRangeDetector(table, energies, config=config).maps(cepstra, MINUTES[:1])
     np.testing.assert_array_equal(maps["range"], config.range_m)
     np.testing.assert_array_equal(maps["range_rate"], config.range_rate)
+
+
+@pytest.mark.parametrize("beyond", [{"max_range_m": 80e3}, {"max_range_rate_mps": 20.0}])
+def test_a_grid_that_reaches_beyond_the_models_is_refused(table, beyond):
+    config = RangeDetectorConfig(**beyond)
+    with pytest.raises(ModelError, match="--detector analytic"):
+        LearnedRangeDetector.from_model(table, None, config)
 
 
 def test_calibrations_that_cannot_be_are_refused():

@@ -10,6 +10,7 @@ from obsnet.errors import ConfigError, LayoutError
 from obsnet.layout import PROPAGATION, require
 from obsnet.ocean.bottom import Bottom
 from obsnet.ocean.rays import (
+    delay_echoes,
     interpolate,
     phase_difference,
     propagation,
@@ -297,3 +298,29 @@ def test_bad_pairs_are_refused(constant, pair, message):
 def test_a_table_without_pressure_is_refused(constant):
     with pytest.raises(LayoutError, match="lacks pressure"):
         strongest_delay(constant.drop_vars("pressure"))
+
+
+def test_a_late_echo_is_that_of_a_layer_below_the_floor():
+    # Oracle: images in water of constant speed with a second floor h deeper, whose echoes make the layer's
+    # crossing twice; the direct path ends at the station as before.
+    depth, below, speed = 3000.0, 30.0, 1500.0
+    config = OceanConfig(
+        profile="constant", sound_speed_mps=speed, max_range_m=30e3, echo_delay_s=2 * below / speed
+    )
+    table = propagation_table(config, depth)
+    range_m = table["range"].values
+    for path, echoes in ((1, 0), (3, 1), (5, 2)):
+        height = path * depth + 2 * echoes * below
+        found = table["delay"].sel(path=path).values
+        # Exact but for the slowness at which the layer is crossed, taken at the path without it.
+        assert np.abs(found - np.hypot(range_m, height) / speed).max() < 5e-4, path
+        slope = np.gradient(found, range_m)
+        assert np.abs(table["slowness"].sel(path=path).values - slope)[1:-1].max() < 1e-7
+    assert table.attrs["echo_delay_s"] == pytest.approx(0.04)
+
+
+def test_echo_delays_add_up_and_none_is_the_water_alone(table):
+    assert delay_echoes(table, 0.0).equals(table)
+    twice = delay_echoes(delay_echoes(table, 0.03), 0.02)
+    assert np.nanmax(np.abs(twice["delay"] - delay_echoes(table, 0.05)["delay"])) < 1e-3
+    assert twice.attrs["echo_delay_s"] == pytest.approx(0.05)

@@ -95,6 +95,26 @@ def test_no_course_above_a_score_is_left_out(monkeypatch, jointly, many):
     assert np.array_equal(grid.scores_above(cells, -np.inf), expected)
 
 
+@pytest.mark.parametrize("step", [0.5, 1.0, 3.0, 4.0, 6.0, 8.0, 15.0])
+@pytest.mark.parametrize("course", [np.arange(0.0, 360.0, 10.0), 121.0 + 0.4 * np.arange(-5, 6)])
+def test_courses_are_read_where_they_point_whatever_the_azimuths_step(step, course):
+    # Maps that grow with the cosine from a bearing: what a course reads is that of where it points, to half of
+    # a course's step and what lies between two azimuths of the map.
+    azimuth = np.arange(0.0, 360.0, step)
+    rows = np.cos(np.deg2rad(azimuth - 123.0))[None] * np.ones((len(TILES), 1))
+    scores = ScoreMaps(
+        np.zeros((len(TILES), 2, 2), np.float32), np.array([0.0, 1.0, -1.0, 1.0]),
+        rows.astype(np.float32), step, False,
+    )  # fmt: skip
+    grid = CourseGrid(TILES[6:7], np.array([9000.0]), np.array([8.0]), course, TILES, DELAY, scores)
+    heard = DELAY.emitted(TILES - TILES[6], np.float64(9000.0), np.float64(8.0))
+    bearing = course[:, None] + np.rad2deg(np.arctan2(9000.0, 8.0 * heard))
+    exact = [best_run(row) for row in np.cos(np.deg2rad(bearing - 123.0))]
+    half = 0.5 * min(step, course[1] - course[0])
+    worst = len(TILES) * (np.deg2rad(half) + np.deg2rad(step) ** 2 / 8)
+    assert np.abs(grid.scores(np.array([0]))[0] - exact).max() < worst
+
+
 def test_every_cell_comes_once_the_greatest_bounds_first():
     bounds = np.random.default_rng(6).standard_normal((30, 40, 3)).astype(np.float32)
     batches = list(best_first(bounds))

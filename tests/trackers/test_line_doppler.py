@@ -55,6 +55,15 @@ def test_the_shift_is_the_rate_of_emission():
     assert found[0] > 1.004 and found[-1] < 0.996  # pitch falls as the ship goes by
 
 
+def test_where_another_path_is_the_loudest_the_shift_is_that_of_a_path():
+    # Travel time jumps by 3 s at 14.4 km, where the first echo becomes louder than the direct sound.
+    grid = np.arange(0.0, 60e3, 250.0)
+    delay = Delay(np.hypot(grid, np.where(grid < 14_400.0, 1.0, 3.0) * 4340.0) / 1500.0, 250.0)
+    point, tiles = np.array([7200.0, 10_000.0, 60.0, 9.0]), 20.0 * np.arange(720)
+    shift = doppler(point, np.array([1.0]), tiles, delay)[0]
+    assert np.abs(shift - 1.0).max() < 9.0 / 1500.0
+
+
 @pytest.mark.parametrize("steady", [(), (5.0, 7.5, 10.0, 12.5, 15.0, 20.0)])
 @pytest.mark.parametrize("scale", [0.5, 0.75, 1.0, 1.6])
 def test_lines_fall_on_each_other_along_the_right_scale(scale, steady):

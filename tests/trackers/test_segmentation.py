@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from obsnet.errors import ConfigError
-from obsnet.trackers.segmentation import SegmentationConfig, mixture, segments
+from obsnet.trackers.segmentation import SegmentationConfig, mixture, quiet_until, segments
 
 T0 = 1_369_123_200.0
 
@@ -50,6 +50,22 @@ def test_a_gap_of_minutes_does_not_split_a_segment():
     cut = whole.copy()
     cut.iloc[590:610] = np.nan
     assert len(segments(cut)) == len(segments(whole)) == 1
+
+
+def test_no_segment_reaches_over_times_that_are_left_out():
+    # As after a clock that started in 1980: a few minutes, thirty years of nothing, the record.
+    record = presence(count=400, ships=[(0, 100, 200)])
+    for minutes in (1, 7):
+        early = presence(count=minutes)
+        early.index -= 1e9
+        early[:] = 5.0
+        joined = pd.concat([early, record])
+        assert segments(joined) == segments(record)
+        assert segments(joined, ended=False) == segments(record, ended=False)
+        assert quiet_until(joined) == quiet_until(record)
+    ships = presence(count=300, ships=[(100, 200, 300)]), presence(count=300, ships=[(0, 100, 200)])
+    ships[1].index += 12 * 86400.0
+    assert segments(pd.concat(ships)) == [*segments(ships[0]), *segments(ships[1])]
 
 
 def test_a_segment_is_said_while_the_record_goes_on_once_nothing_can_change_it():
