@@ -112,6 +112,21 @@ class RunConfig:
                 choices = ", ".join(get_args(hints[name]))
                 raise ConfigError(f"{name} must be one of {choices}, found {getattr(self, name)!r}")
 
+    def unused(self) -> list[str]:
+        """A note where parameters are given that the detector asked for does not take."""
+        if self.detector not in ("learned", "learned-azimuth"):
+            return []
+        from obsnet.detectors.learned import UNUSED
+
+        given = [
+            f"{section}.{name}"
+            for section, names in UNUSED.items()
+            for name in names
+            if getattr(getattr(self, section), name) != getattr(getattr(RunConfig(), section), name)
+        ]
+        said = f"{', '.join(given)}: of the analytic azimuth detector, the learned one takes none"
+        return [said] if given else []
+
     @property
     def memory_s(self) -> float:
         """How far back a minute's maps depend on the record: what the filters that learn from the past keep, s."""

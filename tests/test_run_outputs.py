@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_info
 
 from obsnet import Station, commands, detect, netcdf
 from obsnet.errors import AISError
+from obsnet.evaluation import evaluate, evaluate_folder
 from obsnet.kinematics import StraightCourse
 from obsnet.pipeline import RunConfig
 from obsnet.run import read_run
@@ -313,8 +314,39 @@ def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_p
     own = read_run(out)
     assert own.config.ocean.propagation_file == str((tmp_path / "own.nc").resolve())
     np.testing.assert_allclose(own.table["delay"].values, slower["delay"].values)
+    assert {path.name for path in out.iterdir()} == FILES | {"propagation.nc"}
+    (tmp_path / "own.nc").unlink()  # the folder has its own
+    np.testing.assert_array_equal(read_run(out).table["delay"].values, own.table["delay"].values)
     near = detections(out)["range_m"] / detections(finished)["range_m"]
     assert near.median() > 1.01
+
+
+def test_a_table_that_was_given_is_the_runs_wherever_it_is_read(
+    stream, inventory, record, tmp_path, unplotted, monkeypatch
+):
+    """Delays of slower water, given in Python: figures and scores of the folder take them, not the configured ocean's."""
+    from obsnet.ocean.rays import propagation_table
+    from obsnet.ocean.sound_speed import OceanConfig
+
+    station = Station.from_stationxml(inventory)
+    slower = propagation_table(OceanConfig(profile="constant", sound_speed_mps=1350.0), station.depth_m)
+    run = detect(stream, station, RunConfig(detector="analytic"), endtime=START + 1800, table=slower)
+    run.write(tmp_path)
+    back = read_run(tmp_path)
+    for name in ("delay", "pressure", "slowness"):
+        np.testing.assert_array_equal(back.table[name].values, slower[name].values)
+    used = []
+
+    def spied(detections, tracks, reference, delay, *more, **limits):
+        used.append(delay(np.array([10e3])))
+        return evaluate(detections, tracks, reference, delay, *more, **limits)
+
+    monkeypatch.setattr("obsnet.evaluation.folder.evaluate", spied)
+    evaluate_folder(tmp_path, record / "ais.csv")
+    np.testing.assert_array_equal(used, [run.delay(np.array([10e3]))])
+    # of the next run nothing of it is left
+    detect(stream, station, RunConfig(detector="analytic"), endtime=START + 1800).write(tmp_path)
+    assert not np.allclose(read_run(tmp_path).table["delay"].values, slower["delay"].values, equal_nan=True)
 
 
 def test_a_gap_costs_its_own_minutes(tracked, finished, stream, tmp_path):

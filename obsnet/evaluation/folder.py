@@ -51,7 +51,8 @@ def evaluate_folder(
     try:
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
         place = station["latitude"], station["longitude"]
-        delay = _delay_of_run(info["config"], station["depth_m"])
+        kept = Path(folder, info["propagation_table"]) if "propagation_table" in info else None
+        delay = _delay_of_run(info["config"], station["depth_m"], kept)
         ambiguous = info.get("azimuth_ambiguity_deg", 360) == 180
         half_known = tracks["track"].isin(info.get("ambiguous_tracks", []))
     except (KeyError, TypeError, ValueError) as error:
@@ -139,12 +140,12 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
 
 
-def _delay_of_run(config: dict[str, Any], depth_m: float) -> DelayFunction:
+def _delay_of_run(config: dict[str, Any], depth_m: float, kept: Path | None = None) -> DelayFunction:
     from obsnet.ocean.rays import propagation_table, travel_time
     from obsnet.pipeline import RunConfig
 
     try:
-        return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m))
+        return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m, kept))
     except ConfigError as error:
         raise LayoutError(
             f"run.json is of another version of obsnet: {error}; run obsnet track again"
