@@ -47,7 +47,7 @@ def evaluate_folder(
         raise ConfigError(
             f"ships are followed and expected to distances above 0, found {max_range_m / 1e3:g} km and {max_cpa_m / 1e3:g} km"
         )
-    detections, tracks, info = read_run(folder)
+    detections, tracks, info = _read_tables(folder)
     try:
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
         place = station["latitude"], station["longitude"]
@@ -91,7 +91,7 @@ def _left_out(others: list[ReferenceTrack], detections: pd.DataFrame, max_cpa_m:
     ]
 
 
-def read_run(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
+def _read_tables(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
     """Detections, tracks and run.json of a folder written by ``obsnet track``.
 
     Raises
