@@ -107,6 +107,18 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def first_change(before: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> str:
+    """The first parameter of nested mappings that differs, in words; empty where none does."""
+    for key in sorted({*before, *now}):
+        old, new, path = before.get(key), now.get(key), f"{where}{key}"
+        if isinstance(old, dict) and isinstance(new, dict):
+            if found := first_change(old, new, f"{path}."):
+                return found
+        elif old != new:
+            return f"{path} = {old!r}, not {new!r}"
+    return ""
+
+
 def _convert(value: Any, hint: Any, path: str) -> Any:
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):

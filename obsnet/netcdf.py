@@ -28,7 +28,12 @@ UNITS = {"frequency": "Hz", "line_frequency": "Hz", "spectrogram_frequency": "Hz
 PACKED = {"range_llr": 0.05}
 """Variables stored as 16-bit integers, and their resolution (CF `scale_factor`)."""
 
-_FILL = np.int16(-32768)
+FILL = np.int16(-32768)
+"""Stands for NaN in packed variables."""
+
+LARGEST = 1600.0
+"""Greatest magnitude of a packed value: what 16 bits hold at the resolutions of `PACKED`."""
+
 _CELLS_AT_ONCE = 1 << 17
 _ROWS_AT_ONCE = 64
 _BINDING = ("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "scale_factor")
@@ -148,7 +153,7 @@ class TimeWriter:
                 values.dims,
                 "i2" if packed else "f4",
                 chunks=(min(rows, 4096), *values.shape[1:]),
-                fillvalue=_FILL if packed else np.float32(np.nan),
+                fillvalue=FILL if packed else np.float32(np.nan),
             )
             variable.attrs.update(values.attrs)
             if packed:
@@ -287,9 +292,9 @@ def pack(name: str, values: np.ndarray) -> np.ndarray:
     packed = np.empty(cells.shape, np.int16)
     for first in range(0, len(cells), _CELLS_AT_ONCE):
         part = slice(first, first + _CELLS_AT_ONCE)
-        scaled = np.clip(cells[part], -1600.0, 1600.0)
+        scaled = np.clip(cells[part], -LARGEST, LARGEST)
         scaled /= np.float32(PACKED[name])
-        np.copyto(np.rint(scaled, out=scaled), np.float32(_FILL), where=np.isnan(scaled))
+        np.copyto(np.rint(scaled, out=scaled), np.float32(FILL), where=np.isnan(scaled))
         packed[part] = scaled
     return packed.reshape(values.shape)
 
@@ -299,5 +304,5 @@ def unpack(name: str, packed: np.ndarray) -> np.ndarray:
     if name not in PACKED:
         return packed
     values = packed * np.float32(PACKED[name])
-    values[packed == _FILL] = np.nan
+    values[packed == FILL] = np.nan
     return values

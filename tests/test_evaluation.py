@@ -299,8 +299,6 @@ def test_table_and_json():
     assert max(map(len, lines)) <= 120
     plain = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert plain["ships"][1]["cpa_time_error_s"] is None and plain["missed"] == [2]
-    frame = result.to_frame()
-    assert list(frame["name"]) == ["SHIP 1", "SHIP 2", "All"]
 
 
 def test_nothing_at_all():

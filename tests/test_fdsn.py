@@ -22,8 +22,9 @@ from obspy import UTCDateTime
 from obspy.clients.filesystem.sds import Client as SDSClient
 from obspy.core.inventory import Channel, Inventory, Network, Response, Site, Station
 
-from obsnet.errors import ConfigError, OutputError, SourceError
+from obsnet.errors import ConfigError, OutputError, SourceError, StationError
 from obsnet.fdsn import Retry, fetch
+from obsnet.fdsn.data_centre import read_stationxml
 from obsnet.signals.station import Station as ObsnetStation
 from obsnet.signals.waveforms import open_waveforms
 
@@ -376,6 +377,17 @@ def test_troubles_that_stay_are_one_line(centre, tmp_path, faults, message):
     assert "\n" not in str(caught.value)
     centre.faults = []
     assert get(centre, tmp_path).fetched == 8
+
+
+def test_a_centre_s_codes_stay_within_the_folder():
+    """Channels and locations of the answer become names of files."""
+    for location, code in (("../..", "BHZ"), ("", "../../../BHZ")):
+        made = Channel(code, location, -21.0, 54.0, -4000.0, 4000.0)
+        station = Station("RR03", -21.0, 54.0, -4000.0, channels=[made])
+        text = io.BytesIO()
+        Inventory([Network("YV", [station])]).write(text, format="STATIONXML")
+        with pytest.raises(StationError, match=r"centre has the code '\.\./"):
+            read_stationxml(text.getvalue(), "http://centre")
 
 
 def test_unknown_stations_channels_and_services(centre, tmp_path):

@@ -32,8 +32,6 @@ from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 
 CHUNK_MINUTES = 60
-EMPTY = -32768
-"""Stands for NaN in packed variables, as in `obsnet.netcdf`."""
 MINUTE_COLUMNS = [
     "time", "coverage", "azimuth_deg", "azimuth_llr", "range_m", "range_rate_mps", "range_llr", "approaching_llr",
     "leaving_llr",
@@ -179,7 +177,7 @@ class DayMaps:
         block = maps.drop_vars(list(maps.coords)).transpose("time", ...)
         for name in netcdf.PACKED:
             if name in block:
-                block[name] = block[name].clip(-1600.0, 1600.0)
+                block[name] = block[name].clip(-netcdf.LARGEST, netcdf.LARGEST)
         try:
             if not self._made:
                 self._make(maps)
@@ -210,7 +208,7 @@ class DayMaps:
                 whole[name] = dims, np.zeros(shape, np.float32), values.attrs
             if name in netcdf.PACKED:
                 packing = {"dtype": "int16", "scale_factor": netcdf.PACKED[name]}
-                encoding[name] |= packing | {"_FillValue": EMPTY, "fill_value": EMPTY}
+                encoding[name] |= packing | {"_FillValue": int(netcdf.FILL), "fill_value": int(netcdf.FILL)}
         whole.to_zarr(self._partial, mode="w", compute=False, encoding=encoding, consolidated=False)
         self._made = True
 

@@ -28,7 +28,7 @@ from typing import Any
 import obspy
 
 import obsnet
-from obsnet.config import to_dict
+from obsnet.config import first_change, to_dict
 from obsnet.detectors.model_card import ModelFile, shipped
 from obsnet.errors import ConfigError, OutputError
 from obsnet.output import prepare_folder, write_text
@@ -135,7 +135,7 @@ class Ledger:
                     f"{path} is not one of obsnet archive; give another output folder"
                 ) from None
             now = json.loads(json.dumps(to_dict(config))) | {"model digests": digests}
-            changed = _first_change(before | {"model digests": held.get("models", {})}, now)
+            changed = first_change(before | {"model digests": held.get("models", {})}, now)
             if changed:
                 raise ConfigError(
                     f"{self.folder} was begun with {changed}; give the same parameters, or another output folder"
@@ -192,15 +192,3 @@ def _canonical(inventory: Any) -> bytes:
     buffer = BytesIO()
     inventory.write(buffer, format="STATIONXML")
     return buffer.getvalue()
-
-
-def _first_change(before: dict[str, Any], now: dict[str, Any], where: str = "") -> str:
-    """The first parameter that differs, in words; empty where none does."""
-    for key in sorted({*before, *now}):
-        old, new, path = before.get(key), now.get(key), f"{where}{key}"
-        if isinstance(old, dict) and isinstance(new, dict):
-            if found := _first_change(old, new, f"{path}."):
-                return found
-        elif old != new:
-            return f"{path} = {old!r}, not {new!r}"
-    return ""

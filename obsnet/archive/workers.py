@@ -81,7 +81,12 @@ class Workers:
 
     def _submit(self, task: Task, flying: dict[Future, Task]) -> None:
         function, argument = task
-        flying[self._executor.submit(function, argument)] = task
+        try:
+            future = self._executor.submit(function, argument)
+        except BrokenExecutor:  # a worker died while results were taken; those under way come back broken
+            self._renew()
+            future = self._executor.submit(function, argument)
+        flying[future] = task
 
     def close(self, wait: bool = False) -> None:
         """Forget what has not begun; leave the workers, or wait until they have gone."""

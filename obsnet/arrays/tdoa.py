@@ -16,38 +16,6 @@ UPSAMPLING = 8
 this."""
 
 
-def cross_correlation_tdoa(
-    segments: np.ndarray,
-    sampling_rate: float,
-    pairs: np.ndarray,
-    max_tdoa_s: np.ndarray,
-    band_hz: list[tuple[float, float]] | None = None,
-    interpolation: Interpolation = "upsampled",
-) -> tuple[np.ndarray, np.ndarray]:
-    """TDOA of each pair at the peak of its cross-correlation, and the correlation coefficient there.
-
-    ``none`` stays on the sampling grid (the stairs of the paper's figures 3–6: errors uniform over a sample);
-    ``parabolic`` puts a parabola through the peak and its neighbours, biased by a hundredth of a sample and
-    more where the click fills the band; ``upsampled`` evaluates the correlation `UPSAMPLING` times denser
-    first, by zero-padding the cross-spectrum, which is exact for what is band-limited.
-
-    Parameters
-    ----------
-    segments : array (hydrophone, time), the same stretch of time on every hydrophone.
-    sampling_rate : Hz
-    pairs : int array (pair, 2)
-    max_tdoa_s : array (pair,), s; the peak is sought within ± this.
-    band_hz : frequency bands (low, high) to correlate in, Hz; all by default.
-
-    Returns
-    -------
-    tdoa : array (pair,), t_i − t_j in s; NaN where a hydrophone is silent or has a gap.
-    coefficient : array (pair,), −1 to 1.
-    """
-    correlation, rate = cross_correlations(segments, sampling_rate, pairs, max_tdoa_s, band_hz, interpolation)
-    return highest_tdoa(correlation, rate, interpolation)
-
-
 def highest_tdoa(
     correlation: np.ndarray, rate: float, interpolation: Interpolation = "upsampled"
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -71,6 +39,18 @@ def cross_correlations(
 
     Lag zero is in the middle; lags beyond a pair's `max_tdoa_s` are NaN, as are pairs with a silent
     hydrophone.
+
+    Parameters
+    ----------
+    segments : array (hydrophone, time), the same stretch of time on every hydrophone; a gap is silence.
+    sampling_rate : Hz
+    pairs : int array (pair, 2)
+    max_tdoa_s : array (pair,), s; lags are t_i − t_j within ± this.
+    band_hz : frequency bands (low, high) to correlate in, Hz; all by default.
+    interpolation : of the peaks. ``none`` stays on the sampling grid (the stairs of the paper's figures 3–6: errors
+        uniform over a sample); ``parabolic`` puts a parabola through a peak and its neighbours, biased by a hundredth
+        of a sample and more where the click fills the band; ``upsampled`` evaluates the correlation `UPSAMPLING` times
+        denser first, by zero-padding the cross-spectrum, which is exact for what is band-limited.
     """
     segments = np.asarray(segments, float)
     if segments.ndim != 2 or segments.shape[1] < 4:

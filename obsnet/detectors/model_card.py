@@ -227,14 +227,15 @@ def run(session: Any, feeds: dict[str, np.ndarray]) -> np.ndarray:
 
 def _check_digest(path: Path, digest: str) -> None:
     """A shipped file must be the one that was shipped; another the one that its ``.sha256`` names, where there is one."""
-    if path.resolve().parent == MODELS:
-        try:
+    beside = path.with_name(path.name + ".sha256")
+    known: str | None = digest
+    try:
+        if path.resolve().parent == MODELS:
             known = json.loads((MODELS / "digests.json").read_text()).get(path.name)
-        except (OSError, ValueError):
-            known = None
-    else:
-        beside = path.with_name(path.name + ".sha256")
-        known = beside.read_text().split()[0] if beside.is_file() and beside.stat().st_size < 1000 else digest
+        elif beside.is_file() and beside.stat().st_size < 1000:
+            known = [*beside.read_text().split(), ""][0]
+    except (OSError, ValueError):
+        known = None
     if known != digest:
         raise ModelError(
             f"{path} was altered: its SHA-256 is not the one on record; reinstall or export it again"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
-
-import pandas as pd
 
 from obsnet.console import counted
 
@@ -61,12 +59,6 @@ class Evaluation:
     coverage: dict[str, dict[str, float]]
     against_lines: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-    def to_frame(self) -> pd.DataFrame:
-        """One row per ship, and the row of all."""
-        return pd.DataFrame(
-            [asdict(row) for row in (*self.ships, self.total)], columns=[f.name for f in fields(ShipScore)]
-        )
 
     def to_json(self) -> dict[str, Any]:
         """Plain containers; NaN becomes None."""

@@ -17,6 +17,7 @@ import obsnet
 from obsnet.console import patiently
 from obsnet.errors import ConfigError, SourceError
 from obsnet.fdsn.sds import Day
+from obsnet.signals.inventory import check_codes
 
 SHORTEST_REQUEST_S = 600.0
 SHORTEST_RECORD = 128
@@ -167,11 +168,13 @@ def _may_pass(error: BaseException, first: bool) -> bool:
 
 
 def read_stationxml(text: bytes, url: str) -> obspy.Inventory:
-    """Metadata of a data centre's answer; `SourceError` where it is none."""
+    """Metadata of a data centre's answer; `SourceError` where it is none, `StationError` for codes that are none."""
     try:
-        return obspy.read_inventory(BytesIO(text), format="STATIONXML")
+        inventory = obspy.read_inventory(BytesIO(text), format="STATIONXML")
     except Exception as error:  # obspy and lxml raise many kinds here, some of them bare
         raise SourceError(f"{url} answers with no StationXML: {_line(error)}") from None
+    check_codes(inventory, url)
+    return inventory
 
 
 def _line(error: BaseException) -> str:

@@ -47,7 +47,7 @@ def train(
     say: Callable[[str], None] = print,
     begin_with: str | Path | None = None,
 ) -> dict[str, float]:
-    """Train, calibrate on validation, measure on test; ``weights.pt`` and ``metrics.json``'s content come back.
+    """Train, calibrate on validation, measure on test; ``weights.pt`` is written, its metrics come back.
 
     Parameters
     ----------
@@ -61,8 +61,21 @@ def train(
     made = restored(begin_with)[0] if begin_with else seeded(trainer.seed, lambda: AzimuthNetwork(network))
     assert isinstance(made, AzimuthNetwork)
     say(f"{len(rows)} rows to train on, {len(check)} to validate, {parameters(made)} parameters")
-    fit(AzimuthProblem(made, labels), rows, check, folder, trainer)
+    _fit(made, prepared, rows, check, folder, labels, trainer)
     return finish(made, prepared, folder, labels, trainer, about, say)
+
+
+def _fit(
+    network: AzimuthNetwork,
+    prepared: PreparedSet | JoinedSets,
+    rows: AzimuthRows,
+    check: AzimuthRows,
+    folder: str | Path,
+    labels: AzimuthTaskConfig,
+    trainer: TrainerConfig,
+) -> None:
+    settings = {"data": prepared.digest(), "labels": asdict(labels)}
+    fit(AzimuthProblem(network, labels), rows, check, folder, trainer, settings)
 
 
 def finetune(
@@ -85,7 +98,7 @@ def finetune(
     check = AzimuthRows(prepared, "validation", labels)
     old = {name: values.clone() for name, values in made.state_dict().items()}
     loss_before = held_out_loss(made, check, calibration, labels)
-    fit(AzimuthProblem(made, labels), rows, check, folder, trainer)
+    _fit(made, prepared, rows, check, folder, labels, trainer)
     loss_after = held_out_loss(made, check, calibration, labels)
     better = loss_after < loss_before
     if not better:

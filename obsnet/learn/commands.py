@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from obsnet.config import build
 from obsnet.console import progress, say
@@ -26,7 +27,12 @@ def _names(paths: str | list[str] | None) -> Any:
 
 def plain(config: DictConfig) -> dict[str, Any]:
     """A composed configuration, interpolations resolved, as plain containers."""
-    made = OmegaConf.to_container(config, resolve=True)
+    try:
+        made = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        line = f"{error.full_key}: {str(error).splitlines()[0]}"
+        hint = "; give station=NAME, of configs/station/NAME.yaml" if "station." in line else ""
+        raise ConfigError(line + hint) from None
     return {str(key): value for key, value in made.items()} if isinstance(made, dict) else {}
 
 

@@ -43,7 +43,6 @@ from obsnet.detectors.azimuth_features import Cells
 from obsnet.errors import ConfigError, OutputError
 
 NO_PHASOR = -32768
-SPLITS = ("train", "validation", "test")
 
 
 @dataclass(frozen=True)

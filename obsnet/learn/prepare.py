@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -31,6 +31,8 @@ from obsnet.signals.spectra import SpectraConfig, iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
 from obsnet.twin.station import simulate
+
+Job = tuple[str, Callable[[], Record | None]]
 
 QUIET_SEEDS = 50_000
 """Where the seeds of the records without ships begin."""
@@ -100,23 +102,32 @@ def prepare(folder: str | Path, data: TwinData | ArchiveData, progress: Any = No
     folder : of the set; a folder prepared with another configuration is refused.
     progress : called with (done, total).
     """
+    partial = functools.partial
+    jobs: list[Job]
+    if isinstance(data, TwinData):
+        courses, seeds = _courses(data.courses), _twin_jobs(data)
+        jobs = [(name, partial(twin_record, name, split, seed, data, courses)) for name, split, seed in seeds]
+    else:
+        spans = _archive_jobs(data)
+        jobs = [(name, partial(archive_record, name, split, span, data)) for name, split, span in spans]
+    return fill(folder, data, jobs, progress)
+
+
+def fill(folder: str | Path, data: Any, jobs: Sequence[Job], progress: Any = None) -> PreparedSet:
+    """Make those of the records that are not there yet, and write provenance.
+
+    Parameters
+    ----------
+    data : the configuration; a folder prepared with another is refused, but for more records.
+    jobs : name of each record, and what makes it (None where there is nothing to be made).
+    """
     prepared = PreparedSet(folder)
     _check_same(prepared, data)
-    jobs: list[tuple[str, str, Any]] = list(
-        _twin_jobs(data) if isinstance(data, TwinData) else _archive_jobs(data)
-    )
     prepared.folder.mkdir(parents=True, exist_ok=True)
     prepared.write_provenance(provenance(data))
-    courses = _courses(data.courses) if isinstance(data, TwinData) else None
-    for done, (name, split, what) in enumerate(jobs, 1):
-        if not prepared.has(name):
-            made = (
-                twin_record(name, split, what, data, courses)
-                if isinstance(data, TwinData)
-                else archive_record(name, split, what, data)
-            )
-            if made is not None:
-                prepared.write(made)
+    for done, (name, make) in enumerate(jobs, 1):
+        if not prepared.has(name) and (made := make()) is not None:
+            prepared.write(made)
         if progress is not None:
             progress(done, len(jobs))
     prepared.write_provenance(
@@ -154,7 +165,7 @@ def git_commit() -> str:
     return text.stdout.strip()
 
 
-def _check_same(prepared: PreparedSet, data: TwinData | ArchiveData) -> None:
+def _check_same(prepared: PreparedSet, data: Any) -> None:
     import json
 
     path = prepared.folder / "provenance.json"

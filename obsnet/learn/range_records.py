@@ -14,7 +14,7 @@ from obsnet.kinematics import StraightCourse
 from obsnet.layout import to_posix
 from obsnet.learn.dataset import PreparedSet, Record, packed_table
 from obsnet.learn.oceans import Ocean, OceanSpread, draw_ocean
-from obsnet.learn.prepare import provenance
+from obsnet.learn.prepare import Job, fill
 from obsnet.signals.cepstrogram import ClutterFilter, cepstrogram, noise_std
 from obsnet.signals.spectra import spectra
 from obsnet.signals.station import Station
@@ -120,24 +120,20 @@ def prepare_hydrophone(folder: str | Path, data: HydrophoneData, progress: Any =
 
     Parameters
     ----------
-    folder : of the set. progress : called with (done, total).
+    folder : of the set; a folder prepared with another configuration is refused.
+    progress : called with (done, total).
     """
-    prepared = PreparedSet(folder)
-    prepared.folder.mkdir(parents=True, exist_ok=True)
-    prepared.write_provenance(provenance(data))
-    jobs = [(split, FIRST_SEEDS[split] + k) for split in FIRST_SEEDS for k in range(getattr(data, split))]
-    for done, (split, seed) in enumerate(jobs, 1):
+
+    def job(split: str, seed: int) -> Job:
         name = f"range-{split}-{seed:05d}"
-        if not prepared.has(name):
-            prepared.write(
-                hydrophone_record(name, split, draw_record(seed, data.hours, depth_m=data.depth_m))
-            )
-        if progress is not None:
-            progress(done, len(jobs))
-    prepared.write_provenance(
-        provenance(data) | {"digest": prepared.digest(), "records": len(prepared.names())}
-    )
-    return prepared
+        return name, lambda: hydrophone_record(
+            name, split, draw_record(seed, data.hours, depth_m=data.depth_m)
+        )
+
+    jobs = [
+        job(split, first + k) for split, first in FIRST_SEEDS.items() for k in range(getattr(data, split))
+    ]
+    return fill(folder, data, jobs, progress)
 
 
 def hydrophone_record(name: str, split: str, made: RangeRecord) -> Record:

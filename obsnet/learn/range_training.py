@@ -21,7 +21,7 @@ from obsnet.detectors.learned_range import RangeCalibration
 from obsnet.detectors.range_features import CONTEXT, RangeFeaturesConfig
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
-from obsnet.learn.dataset import PreparedSet, Record
+from obsnet.learn.dataset import JoinedSets, PreparedSet, Record
 from obsnet.learn.networks import parameters
 from obsnet.learn.prepare import provenance
 from obsnet.learn.range_calibration import calibrate, hear, looked_at, measure, scorer_of
@@ -190,7 +190,8 @@ def train(
     examples = RangeExamples(sets, "train", task)
     check = RangeExamples(sets, "validation", task, examples.prior)
     say(f"{len(examples)} examples to train on, {len(check)} to validate, {parameters(made)} parameters")
-    best = fit(RangeProblem(made, examples.ship_share, task), examples, check, folder, trainer)
+    problem = RangeProblem(made, examples.ship_share, task)
+    best = fit(problem, examples, check, folder, trainer, _settings(sets, problem))
     return finish(
         made, sets, folder, task, trainer, {"validation_loss": best}, about, say, examples.ship_share
     )
@@ -217,7 +218,7 @@ def finetune(
     problem = RangeProblem(network, float(before.get("ship_share", SHIP_SHARE)), task)
     old = {name: values.clone() for name, values in network.state_dict().items()}
     loss_before = _held_out_loss(problem, check)
-    fit(problem, examples, check, folder, trainer)
+    fit(problem, examples, check, folder, trainer, _settings(sets, problem))
     loss_after = _held_out_loss(problem, check)
     better = loss_after < loss_before
     if not better:
@@ -225,10 +226,19 @@ def finetune(
     verdict = "kept the new weights" if better else "kept the old weights"
     say(f"held-out passages: {loss_before:.4f} nats a window before, {loss_after:.4f} after; {verdict}")
     found = {"loss_before": loss_before, "loss_after": loss_after, "adapted": float(better)}
-    digests = " ".join(prepared.digest() for prepared in sets)
-    told = {"set": provenance(task), "data_digest": digests, **found, **(about or {})}
+    told = {"set": provenance(task), "data_digest": _digest(sets), **found, **(about or {})}
     save_weights(Path(folder) / WEIGHTS, network, before | {"finetune": told})
     return found
+
+
+def _digest(sets: Sequence[PreparedSet]) -> str:
+    """Digests of prepared sets."""
+    return JoinedSets([prepared.folder for prepared in sets]).digest()
+
+
+def _settings(sets: Sequence[PreparedSet], problem: RangeProblem) -> dict[str, Any]:
+    """What a training is of, as `fit` wants to know."""
+    return {"data": _digest(sets), "task": asdict(problem.task), "ship share": problem.ship_share}
 
 
 def _held_out_loss(problem: RangeProblem, examples: RangeExamples) -> float:
@@ -277,7 +287,7 @@ def finish(
         "calibration": asdict(calibration),
         "metrics": found,
         "ship_share": ship_share,
-        "data_digest": " ".join(prepared.digest() for prepared in sets),
+        "data_digest": _digest(sets),
         "made": provenance(trainer),
         **(about or {}),
     }

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +18,9 @@ from lightning.pytorch.loggers import CSVLogger
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from obsnet.config import first_change
 from obsnet.errors import ConfigError, ModelError
+from obsnet.learn.dataset import digest
 from obsnet.output import prepare_folder
 
 Batch = dict[str, Tensor]
@@ -62,11 +64,28 @@ class Problem(Protocol):
 class DetectorTask(lightning.LightningModule):
     """Lightning's view of a `Problem`."""
 
-    def __init__(self, problem: Problem, config: TrainerConfig, steps: int) -> None:
+    def __init__(
+        self, problem: Problem, config: TrainerConfig, steps: int, order: torch.Generator, settings: str
+    ) -> None:
         super().__init__()
         self.problem, self.config, self._steps = problem, config, steps
         self.network = problem.network
+        self._order, self._settings = order, settings
         self._generator = torch.Generator().manual_seed(config.seed)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """What the training is of, and where its random numbers stand: order, augmentation, and torch's own for dropout."""
+        checkpoint["settings"] = self._settings
+        checkpoint["random"] = [
+            self._order.get_state(), self._generator.get_state(), torch.get_rng_state()
+        ]  # fmt: skip
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Random numbers go on where they stood."""
+        order, augmentation, other = checkpoint["random"]
+        self._order.set_state(order)
+        self._generator.set_state(augmentation)
+        torch.set_rng_state(other)
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """One batch."""
@@ -109,24 +128,36 @@ def fit(
     validation: Dataset,
     folder: str | Path,
     config: TrainerConfig,
+    settings: dict[str, Any],
     progress: bool = True,
 ) -> float:
     """Train a problem's network; the best weights by validation stay in it.
 
     Parameters
     ----------
-    folder : of checkpoints and ``log/version_0/metrics.csv``; training goes on from ``last.ckpt`` where there is one.
+    folder : of checkpoints and losses (``log/version_N/metrics.csv``, a version each time that it goes on). Training goes on
+        from ``last.ckpt`` where there is one, as if nothing had stopped it.
+    settings : what else the training is of, above all the data's digest, as plain values.
 
     Returns
     -------
     The best validation loss.
+
+    Raises
+    ------
+    ConfigError : the folder holds another training, with other data, settings, first weights or trainer (it may be given more
+        minutes); or the time was too short for an epoch.
     """
     folder = prepare_folder(folder)
+    last = folder / "last.ckpt"
+    told = _told(problem.network, config, settings)
+    if last.is_file():
+        _check_same(last, told)
     torch.set_num_threads(config.threads)
     order = torch.Generator().manual_seed(config.seed + 1)
     loader = DataLoader(train, config.batch, shuffle=True, generator=order)
     check = DataLoader(validation, config.batch)
-    task = DetectorTask(problem, config, max(len(loader), 1) * config.epochs)
+    task = DetectorTask(problem, config, max(len(loader), 1) * config.epochs, order, told)
     best = ModelCheckpoint(
         folder, "best", monitor="validation_loss", save_last=True, enable_version_counter=False
     )
@@ -137,7 +168,6 @@ def fit(
         callbacks=[best, EarlyStopping("validation_loss", patience=config.patience)],
         num_sanity_val_steps=0,
     )  # fmt: skip
-    last = folder / "last.ckpt"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
@@ -147,6 +177,25 @@ def fit(
     task.load_state_dict(state)
     assert best.best_model_score is not None
     return float(best.best_model_score)
+
+
+def _told(network: nn.Module, config: TrainerConfig, settings: dict[str, Any]) -> str:
+    """All that decides what a training ends in, as JSON."""
+    trainer = asdict(config)
+    del trainer["max_minutes"]
+    first = digest({name: values.numpy() for name, values in network.state_dict().items()})
+    return json.dumps({"trainer": trainer, "first weights": first[:12], **settings}, default=str)
+
+
+def _check_same(last: Path, told: str) -> None:
+    """Raise `ConfigError` unless a checkpoint is of the training that is told."""
+    try:
+        before = json.loads(torch.load(last, map_location="cpu", weights_only=True).get("settings", "{}"))
+    except Exception as error:  # torch raises whatever its unpickler met
+        line = str(error).splitlines()[0][:120]
+        raise ConfigError(f"{last} cannot be read: {line}; remove it or name another folder") from None
+    if changed := first_change(before, json.loads(told)):
+        raise ConfigError(f"{last} is of a training with {changed}; name another folder")
 
 
 def save_weights(path: str | Path, network: nn.Module, about: dict[str, Any]) -> None:

@@ -194,13 +194,6 @@ class SoundSpeed:
         nodes = np.concatenate(([0.0], inner, [depth_m]))
         return nodes, self.speed(nodes)
 
-    def mean_speed(self, depth_m: float) -> float:
-        """Depth over vertical travel time, m/s: the constant speed of the same vertical delay."""
-        depths, speeds = self.column(depth_m)
-        middle, half = (speeds[1:] + speeds[:-1]) / 2, np.diff(speeds) / 2
-        contrast = np.maximum(np.abs(half / middle), 1e-9)
-        return float(depth_m / np.sum(np.diff(depths) / middle * np.arctanh(contrast) / contrast))
-
 
 @dataclass(frozen=True)
 class OceanConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +15,9 @@ import obspy
 from obsnet.errors import StationError
 from obsnet.layout import parse_utc
 
+_CODE = re.compile(r"[A-Za-z0-9_-]{0,16}")
+"""Of SEED identifiers, which become names of files and folders: no dot, no slash."""
+
 
 def describe(source: Any) -> str:
     """How a message names the source."""
@@ -21,9 +25,10 @@ def describe(source: Any) -> str:
 
 
 def read(source: Any) -> Any:
-    """Parse StationXML without entities, networks or half-read files."""
+    """Parse StationXML without entities, half-read files or codes that are none; an obspy Inventory is taken as it is."""
     if not isinstance(source, (str, Path)):
         if hasattr(source, "networks"):
+            check_codes(source, describe(source))
             return source
         raise StationError(
             f"a station needs a StationXML path or an obspy Inventory, found {type(source).__name__}"
@@ -41,7 +46,7 @@ def read(source: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            return obspy.read_inventory(BytesIO(content), format="STATIONXML")
+            inventory = obspy.read_inventory(BytesIO(content), format="STATIONXML")
         except Exception as error:  # the XML parser and obspy's plugin raise whatever they meet
             detail = " ".join(str(error).split())[:120] or type(error).__name__
             if isinstance(error, TypeError) and "NoneType" in detail:
@@ -49,6 +54,20 @@ def read(source: Any) -> Any:
             if b"<FDSNStationXML" not in content and b":FDSNStationXML" not in content:
                 detail = "it has no FDSNStationXML element; give the station's StationXML"
             raise StationError(f"{source} is not a StationXML that can be read: {detail}") from None
+    check_codes(inventory, describe(source))
+    return inventory
+
+
+def check_codes(inventory: Any, where: str) -> None:
+    """Raise `StationError` where a network, station, location or channel has a code that no file could be named by."""
+    for network in inventory.networks:
+        for station in network.stations:
+            parts = [((item.location_code or "").strip(), item.code) for item in station.channels]
+            for code in (network.code, station.code, *(code for pair in parts for code in pair)):
+                if not _CODE.fullmatch(code or ""):
+                    raise StationError(
+                        f"{where} has the code {code!r}; a code is at most 16 letters, digits, _ and -"
+                    )
 
 
 def find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, str]:

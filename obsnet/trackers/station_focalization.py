@@ -15,7 +15,6 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter1d
 
 from obsnet.errors import ConfigError, LayoutError
-from obsnet.layout import from_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.trackers.focalization import RANGE, FocalizationConfig, FocalizationFilter, Scan
 from obsnet.trackers.tdoa_association import TableModel
@@ -101,21 +100,6 @@ class StationScans:
     range_m: np.ndarray
     log_density: np.ndarray
     scan_llr: np.ndarray
-
-    def to_dataset(self) -> xr.Dataset:
-        """The same with dims time and range, units in attributes."""
-        units = {"m": ("range_mean_m", "range_std_m", "range_mode_m"), "s": ("travel_time_s",)}
-        units |= {"m/s": ("range_rate_mps", "range_rate_std_mps"), "ln(1/m)": ("log_density",)}
-        unit_of = {name: unit for unit, names in units.items() for name in names}
-        variables = {}
-        for entry in fields(self):
-            if entry.name in ("time_s", "range_m"):
-                continue
-            values = getattr(self, entry.name)
-            dims = ("time", "range")[: values.ndim]
-            variables[entry.name] = (dims, values, {"units": unit_of.get(entry.name, "1")})
-        coordinates = {"time": from_posix(self.time_s), "range": ("range", self.range_m, {"units": "m"})}
-        return xr.Dataset(variables, coordinates)
 
 
 class StationFocalization:

@@ -22,6 +22,11 @@ def sample_index(time: float, sampling_rate: float) -> int:
     return int(np.ceil(round(time * sampling_rate, 4)))
 
 
+def named(*numbers: int) -> np.random.SeedSequence:
+    """The seed that whole numbers name; those of blocks before 1970 are negative."""
+    return np.random.SeedSequence([number % 2**63 for number in numbers])
+
+
 def gaussian_noise(
     seed: tuple[int, ...],
     first: int,
@@ -82,7 +87,7 @@ def gaussian_noise(
 def _block(
     seed: tuple[int, ...], frequency: np.ndarray, length: int, colour: Colour, draws: int, analytic: bool
 ) -> np.ndarray:
-    generator = np.random.Generator(np.random.SFC64(np.random.SeedSequence([s % 2**63 for s in seed])))
+    generator = np.random.Generator(np.random.SFC64(named(*seed)))
     parts = generator.standard_normal((frequency.size, draws, 2), dtype=np.float32)
     variates = np.ascontiguousarray(parts.view(np.complex64)[..., 0].T)
     amplitude = colour(frequency, variates) * np.float32(np.sqrt(frequency[1]))

@@ -210,8 +210,10 @@ def add_moving_source(
         return
     low = min(track.emitted.min() for track in heard)
     high = max(track.emitted.max() for track in heard)
-    begin = int(np.floor((start + low) * rate)) - 2 * TAPS
-    length = int(np.ceil((high - low) * rate)) + 4 * TAPS
+    # The source and its image are read up to δ beside the emission time.
+    beside = max(2 * TAPS, TAPS + int(np.ceil(max(track.dipole.max() for track in heard) * rate)))
+    begin = int(np.floor((start + low) * rate)) - beside
+    length = int(np.ceil((high - low) * rate)) + 2 * beside
     signal = emission.samples(begin, length)  # type: ignore[attr-defined]
     for track in heard:
         position = track.emitted * rate + (OVERSAMPLING * first - begin)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import fft
 
 from obsnet.errors import ConfigError
-from obsnet.twin.noise import Wander, below_nyquist
+from obsnet.twin.noise import Wander, below_nyquist, named
 from obsnet.twin.propagate import Field
 from obsnet.twin.sea import IMPEDANCE
 from obsnet.twin.ship import LineSeries, LineTrain
@@ -48,7 +48,7 @@ class Earthquakes:
         """Times [s since 1970] and seeds of the events between `start` and `end`."""
         found = []
         for block in range(int(start // DRAW_S), int(end // DRAW_S) + 1):
-            generator = np.random.default_rng([self.seed, 31, block])
+            generator = np.random.default_rng(named(self.seed, 31, block))
             times = (block + generator.random(generator.poisson(self.per_day * DRAW_S / 86400.0))) * DRAW_S
             found += [(float(time), 1000 * block + i) for i, time in enumerate(times) if start <= time < end]
         return found
@@ -58,7 +58,7 @@ def add_earthquakes(field: Field, first: int, sampling_rate: float, earthquakes:
     """Add earthquakes to `field`, whose samples begin at `first` since 1970."""
     start, count = first / sampling_rate, field.pressure.size
     for time, number in earthquakes.events(start - EVENT_S, start + count / sampling_rate):
-        event = _event(np.random.default_rng([earthquakes.seed, 32, number]), earthquakes, sampling_rate)
+        event = _event(np.random.default_rng(named(earthquakes.seed, 32, number)), earthquakes, sampling_rate)
         begin = round((time - start) * sampling_rate)
         low, high = max(begin, 0), min(begin + event.shape[1], count)
         for values, row in zip((field.pressure, field.east, field.north, field.down), event, strict=True):

@@ -194,7 +194,8 @@ def simulate_folder(
     recorder = Recorder.random(generator, **_described(station))  # type: ignore[arg-type]
     begin = _seconds(start) if start else None
     if ais is None:
-        scenario = Scenario.random(seed, hours, ships, begin or DEFAULT_START, recorder=recorder)
+        begin = DEFAULT_START if begin is None else begin
+        scenario = Scenario.random(seed, hours, ships, begin, recorder=recorder)
     else:
         scenario = _after_ais(ais, seed, hours, begin, recorder)
     written = write_simulation(scenario, out, progress=progress)

@@ -13,7 +13,7 @@ import numpy as np
 from obsnet.errors import ConfigError
 from obsnet.kinematics import StraightCourse
 from obsnet.twin.course import Course
-from obsnet.twin.noise import below_nyquist
+from obsnet.twin.noise import below_nyquist, named
 from obsnet.twin.propagate import Field, Paths
 
 Species = Literal["fin", "blue_z", "pygmy_blue", "blue_d"]
@@ -121,7 +121,10 @@ class Whale:
         first, last = int(start // song.interval_s) - 2, int(end // song.interval_s) + 3
         blocks = range(first // CALLS_PER_DRAW, last // CALLS_PER_DRAW + 1)
         shifts = np.concatenate(
-            [np.random.default_rng([self.seed, 21, block]).uniform(-1, 1, CALLS_PER_DRAW) for block in blocks]
+            [
+                np.random.default_rng(named(self.seed, 21, block)).uniform(-1, 1, CALLS_PER_DRAW)
+                for block in blocks
+            ]
         )
         number = np.arange(blocks.start * CALLS_PER_DRAW, blocks.stop * CALLS_PER_DRAW)
         times = (number + song.jitter * shifts) * song.interval_s

@@ -204,6 +204,15 @@ def test_what_cannot_be_is_one_line(command, sds, tmp_path, options, expected):
     assert errors[0].startswith("obsnet: error: ")
 
 
+def test_codes_that_lead_out_of_the_folder_are_one_line(command, sds, record, tmp_path):
+    evil = tmp_path / "in" / "evil.xml"
+    evil.parent.mkdir()
+    evil.write_text((record / "station.xml").read_text().replace('code="XX"', 'code="../../evil"'))
+    status, _, errors = command(sds, tmp_path / "deep" / "out", "--stations", evil)
+    assert status == 2 and len(errors) == 1 and "has the code '../../evil'" in errors[0]
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == {evil}
+
+
 def test_a_folder_that_is_no_archive_is_one_line(command, record, tmp_path):
     status, _, errors = command(record, tmp_path / "out")
     assert status == 2 and "is not an SDS archive" in errors[0]

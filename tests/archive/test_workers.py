@@ -1,6 +1,7 @@
 """Workers of an archive: processes that may die, and a Dask cluster."""
 
 import math
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -42,6 +43,24 @@ def test_a_worker_that_dies_is_a_result_and_the_others_are_done():
     assert isinstance(found.pop((os._exit, 9)), WorkerDied)
     assert list(found.values()) and all(value == math.sqrt(task[1]) for task, value in found.items())
     assert len(found) == 3
+
+
+def test_workers_that_die_while_a_result_is_taken_are_replaced():
+    """The pool is broken by the time that the next task would be sent."""
+    tasks = [(math.sqrt, 4.0), (time.sleep, 2.0), (math.sqrt, 81.0), (math.sqrt, 25.0)]
+    before, found = set(multiprocessing.active_children()), {}
+
+    def finished(task, result):
+        found[task] = result
+        if task == tasks[0]:
+            for worker in set(multiprocessing.active_children()) - before:
+                worker.kill()
+            time.sleep(1.0)
+        return []
+
+    with local_workers(2) as workers:
+        workers.run(tasks, finished)
+    assert found == dict(zip(tasks, [2.0, None, 9.0, 5.0], strict=True))
 
 
 def test_workers_have_one_thread():

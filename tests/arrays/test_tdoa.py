@@ -3,7 +3,7 @@ import pytest
 
 from obsnet.arrays.compact import CompactArray
 from obsnet.arrays.joint_tdoa import joint_tdoa
-from obsnet.arrays.tdoa import cross_correlation_tdoa, cross_correlations, quantised, tdoa_variance
+from obsnet.arrays.tdoa import cross_correlations, highest_tdoa, quantised, tdoa_variance
 from obsnet.errors import ConfigError, LayoutError
 
 RATE = 96_000.0
@@ -16,6 +16,12 @@ def click(delay_s):
     """Band-limited click at 10 ms + `delay_s`, delayed exactly in the frequency domain."""
     shape = np.exp(-0.5 * ((FREQUENCY - 11e3) / 4.5e3) ** 2) * (FREQUENCY > 2e3) * (FREQUENCY < 20e3)
     return np.fft.irfft(shape * np.exp(-2j * np.pi * FREQUENCY * (0.010 + delay_s)), LENGTH)
+
+
+def cross_correlation_tdoa(segments, rate, pairs, max_tdoa_s, band_hz=None, interpolation="upsampled"):
+    """TDOA of each pair at the highest peak, and the coefficient there."""
+    found = cross_correlations(segments, rate, pairs, max_tdoa_s, band_hz, interpolation)
+    return highest_tdoa(*found, interpolation)
 
 
 def biases(interpolation):

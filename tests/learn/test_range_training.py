@@ -105,6 +105,14 @@ def test_trained_weights_are_calibrated_anew_for_another_look_and_stay_as_they_a
     assert found["validation_loss"] == trained[1]["validation_loss"]
 
 
+def test_a_folder_belongs_to_one_training(trained, prepared):
+    network = RangeNetworkConfig(hidden=8, code=4, head=8)
+    trainer = TrainerConfig(epochs=2, batch=8)
+    other = replace(TASK, patch_noise=0.1)
+    with pytest.raises(ConfigError, match=r"task\.patch_noise = 0\.3, not 0\.1; name another folder"):
+        train([prepared], trained[0].parent, network, other, trainer, say=lambda text: None)
+
+
 def test_the_exported_model_says_the_same_and_detects(trained, prepared, tmp_path):
     model = export_range(trained[0], tmp_path / "range.onnx")
     assert range_parity(trained[0], model, prepared.folder) < 1e-4
@@ -157,6 +165,18 @@ def test_hydrophone_records_are_prepared_once(tmp_path, monkeypatch):
     assert len(known_minutes(held)) == len(held.minute)
     monkeypatch.setattr("obsnet.learn.range_records.draw_record", None)
     assert prepare_hydrophone(tmp_path, data).digest() == made.digest()
+
+
+def test_hydrophone_records_are_not_mixed_with_others(tmp_path, monkeypatch):
+    from obsnet.learn import range_records
+
+    drawn = range_records.draw_record
+    monkeypatch.setattr(range_records, "draw_record", lambda seed, hours, depth_m: drawn(0, 0.2, 0))
+    data = HydrophoneData(train=1, validation=1)
+    prepare_hydrophone(tmp_path, data)
+    assert len(prepare_hydrophone(tmp_path, replace(data, train=2)).names()) == 3
+    with pytest.raises(ConfigError, match="another hours, depth_m"):
+        prepare_hydrophone(tmp_path, replace(data, hours=0.4, depth_m=3000.0))
 
 
 def test_hydrophone_records_may_share_a_depth():

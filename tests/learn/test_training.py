@@ -93,12 +93,36 @@ def test_the_same_seed_gives_the_same_weights(run, prepared, tmp_path):
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
-def test_training_goes_on_where_it_was_interrupted(prepared, tmp_path):
-    short = replace(TRAINER, epochs=1)
-    training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), short, say=lambda text: None)
-    before = torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"]
+def test_training_goes_on_where_it_was_interrupted(run, prepared, tmp_path, monkeypatch):
+    calls, loss = [], training.AzimuthProblem.loss
+
+    def failing(*arguments):
+        calls.append(arguments)
+        if len(calls) == 20:
+            raise OSError("the power fails")
+        return loss(*arguments)
+
+    monkeypatch.setattr(training.AzimuthProblem, "loss", failing)
+    with pytest.raises(OSError, match="power"):
+        training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 0
     training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
-    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2 * before
+    whole, resumed = (load_weights(folder / "weights.pt")[0] for folder in (run, tmp_path))
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_a_folder_belongs_to_one_training(run, prepared, tmp_path):
+    """More passages, or another experiment in its folder, are another training, not the old one under a new name."""
+    grown = PreparedSet(tmp_path)
+    for record in prepared.records():
+        grown.write(record)
+    grown.write(made_record("train-new", "train", True, 7))
+    before = (run / "weights.pt").read_bytes()
+    with pytest.raises(ConfigError, match=r"a training with data = .*; name another folder"):
+        training.train(grown, run, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    with pytest.raises(ConfigError, match="name another folder"):
+        training.finetune(prepared, run, run / "weights.pt", trainer=TRAINER, say=lambda text: None)
+    assert (run / "weights.pt").read_bytes() == before
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path):
@@ -169,6 +193,10 @@ def test_altered_files_are_refused(model, tmp_path):
     (tmp_path / "azimuth.onnx.sha256").write_text((model.parent / "azimuth.onnx.sha256").read_text())
     with pytest.raises(ModelError, match="altered"):
         ModelFile.read(target)
+    for digest in (b"", b" \n", b"\xff\xfe"):
+        (tmp_path / "azimuth.onnx.sha256").write_bytes(digest)
+        with pytest.raises(ModelError, match="altered"):
+            ModelFile.read(target)
     (tmp_path / "half.onnx").write_bytes(model.read_bytes()[: len(content) // 2])
     with pytest.raises(ModelError, match="damaged"):
         ModelFile.read(tmp_path / "half.onnx")

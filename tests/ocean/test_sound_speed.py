@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from obsnet.config import build
 from obsnet.errors import ConfigError
@@ -28,12 +27,6 @@ def test_nodes_follow_the_curve():
 def test_mixed_layer_grows_with_pressure_alone():
     speed = Munk(mixed_layer_m=50.0).speed(np.array([0.0, 20.0, 50.0]))
     np.testing.assert_allclose(np.diff(speed) / [20.0, 30.0], 0.0163, rtol=1e-6)
-
-
-def test_mean_speed_is_that_of_the_vertical_travel_time():
-    time = quad(lambda z: 1.0 / CANONICAL.speed(z), 0.0, 4000.0)[0]
-    assert SoundSpeed.munk(CANONICAL).mean_speed(4000.0) == pytest.approx(4000.0 / time, abs=0.001)
-    assert SoundSpeed.constant(1503.0).mean_speed(2000.0) == pytest.approx(1503.0, rel=1e-12)
 
 
 @pytest.mark.parametrize(

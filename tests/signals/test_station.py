@@ -169,6 +169,21 @@ def test_the_code_may_be_left_out_or_shortened_where_that_is_unique():
         Station.from_stationxml(two)
 
 
+@pytest.mark.parametrize("code", ["../../../evil", "RR/03", "..", "R R", "RÄ03", "R" * 30])
+def test_codes_that_could_lead_out_of_a_folder_are_refused(xml, code):
+    """Codes become names of files and folders."""
+    path = xml()
+    text = path.read_text()
+    for element in ("Network", "Station"):
+        path.write_text(re.sub(rf"(<{element} [^>]*code=)\"[^\"]*\"", rf'\g<1>"{code}"', text))
+        with pytest.raises(StationError, match=rf"station\.xml has the code '{re.escape(code)}'"):
+            Station.from_stationxml(path)
+    with pytest.raises(StationError, match="the inventory has the code"):
+        Station.from_stationxml(inventory(standard(), code=code))
+    with pytest.raises(StationError, match="has the code"):
+        Station.from_stationxml(inventory([channel(code)]))
+
+
 BAD_FILES = {
     "empty": (b"", "is empty"),
     "text": (b"network,station\nYV,RR03\n", "is not a StationXML"),

@@ -401,6 +401,14 @@ def test_folder_of_random_ships_and_of_ais(tmp_path):
         simulate_folder(tmp_path / "three", start="noon")
 
 
+@pytest.mark.parametrize("start", ["1970-01-01T00:00:00Z", "1968-12-31T23:55:00Z"])
+def test_a_record_begins_when_it_should(tmp_path, start):
+    said = simulate_folder(tmp_path, hours=0.1, seed=5, start=start)
+    assert f"from {start}" in said
+    stream = obspy.read(str(tmp_path / "waveforms.mseed"))
+    assert abs(min(trace.stats.starttime for trace in stream) - obspy.UTCDateTime(start)) < 1.0
+
+
 def test_ais_without_a_ship_near_the_station_is_refused(half_hour, tmp_path):
     half_hour.write(tmp_path)
     Recorder(latitude=-25.0, longitude=54.0).inventory().write(tmp_path / "far.xml", format="STATIONXML")

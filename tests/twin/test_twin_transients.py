@@ -101,6 +101,17 @@ def test_any_part_equals_the_cut_from_the_whole(paths, kind):
         np.testing.assert_allclose(getattr(part, name), expected, atol=2e-3 * max(np.std(expected), 1e-30))
 
 
+def test_whales_and_earthquakes_were_there_before_1970():
+    calls = Whale("fin", seed=4).calls(-86400.0, 3600.0)
+    assert calls[0] < -86000.0 and calls[-1] > 3000.0
+    assert np.median(np.diff(calls)) == pytest.approx(13.0, abs=0.3)
+    events = Earthquakes(per_day=300.0, seed=1).events(-3 * 86400.0, 0.0)
+    assert len(events) == pytest.approx(900, abs=5 * np.sqrt(900))
+    field = Field.silence(30_000)
+    add_earthquakes(field, -60_000, RATE, Earthquakes(per_day=300.0, seed=1))
+    assert np.abs(field.pressure).max() > 0.0
+
+
 def test_earthquakes_come_at_their_rate_on_every_component():
     events = Earthquakes(per_day=12.0, seed=3).events(START, START + 60 * 86400.0)
     assert len(events) == pytest.approx(720, abs=5 * np.sqrt(720))
