@@ -243,6 +243,7 @@ def calibrate(
 
     settings = commands.run_config(config, overrides, None, None)
     where = commands.read_station(station, code, start, depth_m=depth)
+    where = commands.placed(where, waveforms, settings, start, end)
     reference = commands.read_reference(ais, where, max_cpa_m=None, quiet=quiet)
     with staged(out) as folder:
         with console.progress("calibrating", quiet) as progress:

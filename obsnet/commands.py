@@ -58,9 +58,11 @@ def track(
         station_file, code, start, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
+    if ais:
+        station = placed(station, waveforms, settings, start, end)
     reference = read_reference(ais, station, quiet=quiet) if ais else None
     task = runs.track if tracking else runs.detect
-    with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
+    with staged(out, leftovers=("live.csv", runs.PROPAGATION_FILE)) as folder, ExitStack() as stack:
         report = stack.enter_context(Beside(_drawing(folder / "report.png", reference), jobs))
         with console.progress("reading and detecting", quiet) as progress:
             run = task(
@@ -185,7 +187,7 @@ def serve(folder: Path, host: str, port: int, ais: Path | None) -> None:
         folder,
         host,
         port,
-        None if ais is None else (lambda at: reference_tracks(read(ais), at)),
+        None if ais is None else (lambda at: reference_tracks(read(ais, near=at), at)),
         ready,
     )
 
@@ -235,6 +237,18 @@ def read_station(path: Path, code: str | None, start: str | None, **overrides: A
     )
 
 
+def placed(
+    station: Station, waveforms: list[str], settings: RunConfig, start: str | None, end: str | None
+) -> Station:
+    """The station where it lay when a record begins; the record is looked into where it lay in several places."""
+    if not station.moved:
+        return station
+    from obsnet.signals.waveforms import open_waveforms
+
+    rate_hz = settings.spectra.analysis_rate_hz
+    return open_waveforms(waveforms, station, starttime=start, endtime=end, min_rate_hz=rate_hz).station
+
+
 def _calibrated(
     path: Path,
     code: str | None,
@@ -258,7 +272,7 @@ def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3,
     """Reference tracks of an AIS file, around the station; says which rows were dropped, unless quiet."""
     from obsnet.ais import read, reference_tracks
 
-    positions = read(path)
+    positions = read(path, near=(station.latitude, station.longitude))
     for complaint in positions.attrs["report"].complaint():
         if not quiet:
             console.say(f"note: {complaint}")

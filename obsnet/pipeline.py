@@ -100,6 +100,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.azimuth.step_s != self.range.step_s or self.azimuth.window_s != self.range.window_s:
             raise ConfigError("azimuth and range detectors must share window_s and step_s")
+        if (frames := self.azigram.average_frames) != 1:  # means over frames would depend on cuts
+            raise ConfigError(f"a run takes single frames: azigram.average_frames must be 1, found {frames}")
         tile, step, window = self.grid_search.tile_s, self.azimuth.step_s, self.azimuth.window_s
         if abs(tile / step - round(tile / step)) > 1e-9 or tile < window:
             raise ConfigError(
@@ -111,6 +113,19 @@ class RunConfig:
             if getattr(self, name) not in get_args(hints[name]):
                 choices = ", ".join(get_args(hints[name]))
                 raise ConfigError(f"{name} must be one of {choices}, found {getattr(self, name)!r}")
+
+    def unused(self) -> list[str]:
+        """A note where parameters are given that the detector asked for does not take."""
+        if self.detector not in ("learned", "learned-azimuth"):
+            return []
+        from obsnet.detectors.learned import UNUSED
+
+        default, given = RunConfig(), []
+        for section, names in UNUSED.items():
+            one, other = getattr(self, section), getattr(default, section)
+            given += [f"{section}.{name}" for name in names if getattr(one, name) != getattr(other, name)]
+        said = f"{', '.join(given)}: of the analytic azimuth detector, the learned one takes none"
+        return [said] if given else []
 
     @property
     def memory_s(self) -> float:

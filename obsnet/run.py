@@ -21,18 +21,25 @@ from obsnet import netcdf, provenance
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps, known_sides, two_sided
 from obsnet.errors import ConfigError, LayoutError, WaveformError
-from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
-from obsnet.ocean.rays import propagation_table, travel_time
+from obsnet.ocean.rays import propagation_table, travel_time, write_propagation
 from obsnet.output import prepare_folder, write_text
 from obsnet.pipeline import NEEDS_FULL_AZIMUTHS, Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
-from obsnet.sinks import FolderSink, MemorySink
-from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, detections_csv, geojson, tracks_csv
+from obsnet.sinks import FolderSink, MemorySink, read_minutes
+from obsnet.tables import (
+    DETECTION_COLUMNS,
+    TRACK_COLUMNS,
+    detections_csv,
+    geojson,
+    seconds,
+    track_of_row,
+    tracks_csv,
+)
 from obsnet.trackers.grid_search import search
 from obsnet.trackers.remainder import Ghosts
 from obsnet.trackers.segmentation import segments
@@ -45,6 +52,8 @@ if TYPE_CHECKING:
 Progress = Callable[[float, float], None]
 """Called with seconds of record done and in all."""
 
+PROPAGATION_FILE = "propagation.nc"
+"""Of a run's folder, where its table is not that of the configured ocean."""
 NEIGHBOUR_S = 3600.0
 """A track that ended no longer than this before a segment may explain what is heard in it."""
 BEARINGS_SHORTEST_S = 3600.0
@@ -191,7 +200,7 @@ def _run(
         )
         clock.lap("open")
         sink = FolderSink(folder, station) if folder is not None else MemorySink()
-        with Pipeline(station, config, amplitudes, table, threads) as pipeline, sink:
+        with Pipeline(source.station, config, amplitudes, table, threads) as pipeline, sink:
             clock.lap("model")
             for minutes in _stream(source, config, pipeline, progress, clock):
                 sink.append(minutes)
@@ -205,7 +214,8 @@ def _run(
         station = station.without(mute.seed_id)
         source, pipeline, sink, maps, features = listen(station)
         source.report.left_aside[mute.seed_id] = "never works: gone on as if there were no hydrophone"
-    run = Run(station, config, maps, features, sink.detections(), sink.presence(), [], [], pipeline.table)
+    found = sink.detections(), sink.presence()
+    run = Run(source.station, config, maps, features, *found, [], [], pipeline.table)
     if heard is not None:
         heard(run)
     if tracking and len(run.presence):
@@ -213,6 +223,8 @@ def _run(
         run.segments, run.tracks = find_tracks(run, threads)
         clock.lap("track")
     run.info = _describe(run, source, clock) | {"models": pipeline.models}
+    if table is not None or config.ocean.propagation_file:
+        run.info["propagation_table"] = PROPAGATION_FILE
     if amplitudes is not None:
         run.info["amplitudes"] = amplitudes.to_dict()
     return run
@@ -376,7 +388,7 @@ def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.nd
 
 
 def write_tables(run: Run, folder: Path) -> None:
-    """Write detections.csv, tracks.csv, tracks.geojson and run.json."""
+    """Write detections.csv, tracks.csv, tracks.geojson and run.json, and a propagation table that was given."""
     write_text(folder / "detections.csv", detections_csv(run.detections))
     rows = pd.DataFrame([found.row(i) for i, found in enumerate(run.tracks, 1)], columns=TRACK_COLUMNS)
     write_text(folder / "tracks.csv", tracks_csv(rows))
@@ -385,6 +397,8 @@ def write_tables(run: Run, folder: Path) -> None:
         stamps = np.datetime_as_string(run.live["time"].to_numpy("datetime64[s]"))
         live = run.live.assign(time=np.char.add(stamps, "Z"))
         write_text(folder / "live.csv", live.to_csv(index=False, float_format="%.6g"))
+    if kept := run.info.get("propagation_table"):
+        write_propagation(run.table, folder / kept)
     write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
 
 
@@ -415,7 +429,7 @@ def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
 
 
 def _notes(run: Run) -> list[str]:
-    notes = _unused(run.config) if "azimuth_llr" in run.maps else []
+    notes = run.config.unused() if "azimuth_llr" in run.maps else []
     if len(run.presence) and "azimuth" not in run.presence:
         notes.append("no two horizontals: range only, courses are not observed")
     if len(run.presence) and "range" not in run.presence:
@@ -427,24 +441,6 @@ def _notes(run: Run) -> list[str]:
             f"the hydrophone is silent in {alone} minutes: their azimuths are from polarisation, known on which axis but not to which side"
         )
     return notes
-
-
-def _unused(config: RunConfig) -> list[str]:
-    """A note where parameters were given that the detector asked for does not take."""
-    if config.detector not in ("learned", "learned-azimuth"):
-        return []
-    from obsnet.detectors.learned import UNUSED
-
-    default = RunConfig()
-    given = [
-        f"{section}.{name}"
-        for section, names in UNUSED.items()
-        for name in names
-        if getattr(getattr(config, section), name) != getattr(getattr(default, section), name)
-    ]
-    return (
-        [f"{', '.join(given)}: of the analytic azimuth detector, the learned one takes none"] if given else []
-    )
 
 
 def read_run(folder: str | Path) -> Run:
@@ -465,12 +461,13 @@ def read_run(folder: str | Path) -> Run:
         info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         code, *place = (info["station"][key] for key in ("code", "latitude", "longitude", "depth_m"))
         station, config = Station(code, *place), build(RunConfig, info["config"])
-        maps, features = (_minutes(folder / f"{name}.nc", len(found)) for name in ("maps", "features"))
+        maps, features = (read_minutes(folder / f"{name}.nc", len(found)) for name in ("maps", "features"))
         spans = [
-            Segment(_seconds(s["start"]), _seconds(s["end"]), s["cpa"] and _seconds(s["cpa"]))
+            Segment(seconds(s["start"]), seconds(s["end"]), s["cpa"] and seconds(s["cpa"]))
             for s in info["segments"]
         ]
         tracks = [track_of_row(row) for _, row in rows.iterrows()]
+        kept = folder / info["propagation_table"] if "propagation_table" in info else None
     except FileNotFoundError as error:
         missing = Path(error.filename).name if folder.is_dir() else "the folder"
         raise LayoutError(f"{folder} is not a folder of `obsnet track`: {missing} is missing") from None
@@ -484,33 +481,7 @@ def read_run(folder: str | Path) -> Run:
     for name in ("approaching", "leaving"):
         if f"{name}_llr" in features:
             ratios[name] = features[f"{name}_llr"].values
-    table = propagation_table(config.ocean, station.depth_m)
+    table = propagation_table(config.ocean, station.depth_m, kept)
     return Run(
         station, config, maps, features, found, ratios.dropna(axis=1, how="all"), spans, tracks, table, info
     )
-
-
-def _minutes(path: Path, count: int) -> xr.Dataset:
-    """A file of maps or features that holds `count` minutes; a run without minutes has none."""
-    if count == 0:
-        return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
-    path.stat()
-    dataset = netcdf.join_complex(netcdf.read(path))
-    if dataset.sizes["time"] != count:
-        raise ValueError(f"{path.name} holds {dataset.sizes['time']} minutes, detections.csv {count}")
-    return dataset
-
-
-def track_of_row(row: pd.Series) -> Track:
-    """The track of a row of tracks.csv, with variances only: infinite where the row is empty."""
-    start, end, cpa = (_seconds(row[key]) for key in ("start", "end", "cpa_time"))
-    starboard = wrap180(row["cpa_azimuth_deg"] - row["course_deg"]) < 0
-    distance = -row["cpa_distance_m"] if starboard else row["cpa_distance_m"]
-    std = row[["cpa_time_std_s", "cpa_distance_std_m", "course_std_deg", "speed_std_mps"]].astype(float)
-    course = 0.0 if np.isnan(row["course_deg"]) else float(row["course_deg"])
-    motion = StraightCourse(cpa, float(distance), course, float(row["speed_mps"]))
-    return Track(start, end, motion, np.diag(std.fillna(np.inf) ** 2), float(row["log_bayes_factor"]))
-
-
-def _seconds(text: str) -> float:
-    return float(to_posix(np.datetime64(text.removesuffix("Z"))))

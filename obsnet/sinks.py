@@ -1,4 +1,4 @@
-"""Where a run's minutes go as they are finished: into memory, or block by block into a folder."""
+"""Where a run's minutes go as they are finished: into memory, or block by block into a folder, and from there again."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -76,3 +77,14 @@ class FolderSink(MemorySink):
     def __exit__(self, *error: Any) -> None:
         for writer in self._writers:
             writer.__exit__(*error)
+
+
+def read_minutes(path: Path, count: int) -> xr.Dataset:
+    """A file of maps or features that holds `count` minutes; a run without minutes has none."""
+    if count == 0:
+        return xr.Dataset(coords={"time": np.empty(0, "datetime64[ns]")})
+    path.stat()
+    dataset = netcdf.join_complex(netcdf.read(path))
+    if dataset.sizes["time"] != count:
+        raise ValueError(f"{path.name} holds {dataset.sizes['time']} minutes, detections.csv {count}")
+    return dataset

@@ -1,4 +1,4 @@
-"""Detections and tracks out, as the text of the files that people use: CSV and GeoJSON."""
+"""Detections and tracks out, as the text of the files that people use: CSV and GeoJSON; tracks in again."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from obsnet.kinematics import wrap180
-from obsnet.layout import iso
+from obsnet.kinematics import StraightCourse, wrap180
+from obsnet.layout import iso, to_posix
 from obsnet.signals.station import Station
 from obsnet.trackers.track import Track
 
@@ -65,3 +65,19 @@ def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
         line = {"type": "LineString", "coordinates": coordinates}
         features.append({"type": "Feature", "geometry": line, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
+
+
+def track_of_row(row: pd.Series) -> Track:
+    """The track of a row of tracks.csv, with variances only: infinite where the row is empty."""
+    start, end, cpa = (seconds(row[key]) for key in ("start", "end", "cpa_time"))
+    starboard = wrap180(row["cpa_azimuth_deg"] - row["course_deg"]) < 0
+    distance = -row["cpa_distance_m"] if starboard else row["cpa_distance_m"]
+    std = row[["cpa_time_std_s", "cpa_distance_std_m", "course_std_deg", "speed_std_mps"]].astype(float)
+    course = 0.0 if np.isnan(row["course_deg"]) else float(row["course_deg"])
+    motion = StraightCourse(cpa, float(distance), course, float(row["speed_mps"]))
+    return Track(start, end, motion, np.diag(std.fillna(np.inf) ** 2), float(row["log_bayes_factor"]))
+
+
+def seconds(text: str) -> float:
+    """Seconds since 1970 of a time in these files."""
+    return float(to_posix(np.datetime64(text.removesuffix("Z"))))

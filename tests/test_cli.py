@@ -243,6 +243,10 @@ def test_a_span_in_a_gap(refused, stream, tmp_path):
         ("range: {pairs: [1-2]}", "no amplitude is known of the pairs 1-2"),
         ("azimuth: {step_s: 30}", "must share window_s and step_s"),
         (
+            "azigram: {average_frames: 5}",
+            "a run takes single frames: azigram.average_frames must be 1",
+        ),
+        (
             "{azimuth: {window_s: 300}, range: {window_s: 300}, detector: analytic}",
             "tile_s must be a multiple of step_s",
         ),

@@ -13,8 +13,12 @@ import xarray as xr
 from pyproj import Geod
 from threadpoolctl import threadpool_info
 
-from obsnet import Station, detect, netcdf
+from obsnet import Station, commands, detect, netcdf
+from obsnet.errors import AISError
+from obsnet.evaluation import evaluate, evaluate_folder
 from obsnet.kinematics import StraightCourse
+from obsnet.pipeline import RunConfig
+from obsnet.run import read_run
 from obsnet.tables import geojson
 from obsnet.trackers.track import Track
 
@@ -239,7 +243,7 @@ def test_any_split_of_the_record_gives_the_same_rows(tracked, finished, stream, 
 
 def test_a_run_read_again_is_the_run(finished):
     """Segments of the folder's files are those of the run: what tells closing from opening is kept."""
-    from obsnet.run import find_tracks, read_run
+    from obsnet.run import find_tracks
 
     run = read_run(finished)
     found, tracks = find_tracks(run)
@@ -249,11 +253,59 @@ def test_a_run_read_again_is_the_run(finished):
         assert abs(again.motion.cpa_time - kept.motion.cpa_time) < 5.0
 
 
+def test_a_station_that_was_moved_is_where_it_lay_when_its_record_begins(
+    tracked, inventory, record, tmp_path
+):
+    """The record is of the first of two deployments, and so are its depth, its delays and the ships about it."""
+    moved = copy.deepcopy(inventory)
+    (here,) = moved[0]
+    later = copy.deepcopy(here)
+    later.latitude, later.elevation, later.start_date = -45.0, -900.0, START + 86400 * 365
+    for channel in later:
+        channel.start_date = later.start_date
+    moved[0].stations.append(later)
+    moved.write(str(tmp_path / "moved.xml"), "STATIONXML")
+    options = ("--ais", record / "ais.csv", "--end", "2013-05-21T10:30:00Z", "--detector", "analytic")
+    folders = [
+        tracked(record / "waveforms.mseed", *options, station=station, command="detect")
+        for station in (record / "station.xml", tmp_path / "moved.xml")
+    ]
+    (expected, rows), (found, same) = ((read_run(folder), detections(folder)) for folder in folders)
+    assert found.station == expected.station
+    pd.testing.assert_frame_equal(same, rows)
+
+
+def test_ships_are_those_about_the_place_of_the_record(inventory, record, tmp_path):
+    moved = copy.deepcopy(inventory)
+    later = copy.deepcopy(moved[0][0])
+    later.latitude, later.start_date = -45.0, START + 86400 * 365
+    moved[0].stations.append(later)
+    station = Station.from_stationxml(moved)
+    assert station.latitude == -45.0
+    here = commands.placed(station, [str(record / "waveforms.mseed")], RunConfig(), None, None)
+    assert here.latitude == inventory[0][0].latitude
+    assert len(commands.read_reference(record / "ais.csv", here)) == 1
+
+
+def test_of_an_ais_file_the_surroundings_are_held_alone(record, inventory, tmp_path, monkeypatch):
+    """A national archive would not fit."""
+    held = []
+    monkeypatch.setattr("obsnet.ais.reference_tracks", lambda ais, *place, **limits: held.append(ais) or [])
+    near = pd.read_csv(record / "ais.csv")
+    far = near.assign(lat=near["lat"] + 30.0, mmsi=near["mmsi"] + 1)
+    pd.concat([near, far]).to_csv(tmp_path / "both.csv", index=False)
+    far.to_csv(tmp_path / "far.csv", index=False)
+    station = Station.from_stationxml(inventory)
+    commands.read_reference(tmp_path / "both.csv", station)
+    assert set(held[0]["mmsi"]) == set(near["mmsi"])
+    with pytest.raises(AISError, match="too far away"):
+        commands.read_reference(tmp_path / "far.csv", station)
+
+
 def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_path):
     """In slower water a delay is heard from farther off; run.json names the table, and the run reads it back."""
     from obsnet.ocean.rays import propagation_table, write_propagation
     from obsnet.ocean.sound_speed import OceanConfig
-    from obsnet.run import read_run
 
     run = read_run(finished)
     slower = propagation_table(OceanConfig(profile="constant", sound_speed_mps=1450.0), run.station.depth_m)
@@ -262,8 +314,39 @@ def test_the_users_own_delays_are_used_and_said(tracked, finished, record, tmp_p
     own = read_run(out)
     assert own.config.ocean.propagation_file == str((tmp_path / "own.nc").resolve())
     np.testing.assert_allclose(own.table["delay"].values, slower["delay"].values)
+    assert {path.name for path in out.iterdir()} == FILES | {"propagation.nc"}
+    (tmp_path / "own.nc").unlink()  # the folder has its own
+    np.testing.assert_array_equal(read_run(out).table["delay"].values, own.table["delay"].values)
     near = detections(out)["range_m"] / detections(finished)["range_m"]
     assert near.median() > 1.01
+
+
+def test_a_table_that_was_given_is_the_runs_wherever_it_is_read(
+    stream, inventory, record, tmp_path, unplotted, monkeypatch
+):
+    """Delays of slower water, given in Python: figures and scores of the folder take them, not the configured ocean's."""
+    from obsnet.ocean.rays import propagation_table
+    from obsnet.ocean.sound_speed import OceanConfig
+
+    station = Station.from_stationxml(inventory)
+    slower = propagation_table(OceanConfig(profile="constant", sound_speed_mps=1350.0), station.depth_m)
+    run = detect(stream, station, RunConfig(detector="analytic"), endtime=START + 1800, table=slower)
+    run.write(tmp_path)
+    back = read_run(tmp_path)
+    for name in ("delay", "pressure", "slowness"):
+        np.testing.assert_array_equal(back.table[name].values, slower[name].values)
+    used = []
+
+    def spied(detections, tracks, reference, delay, *more, **limits):
+        used.append(delay(np.array([10e3])))
+        return evaluate(detections, tracks, reference, delay, *more, **limits)
+
+    monkeypatch.setattr("obsnet.evaluation.folder.evaluate", spied)
+    evaluate_folder(tmp_path, record / "ais.csv")
+    np.testing.assert_array_equal(used, [run.delay(np.array([10e3]))])
+    # of the next run nothing of it is left
+    detect(stream, station, RunConfig(detector="analytic"), endtime=START + 1800).write(tmp_path)
+    assert not np.allclose(read_run(tmp_path).table["delay"].values, slower["delay"].values, equal_nan=True)
 
 
 def test_a_gap_costs_its_own_minutes(tracked, finished, stream, tmp_path):

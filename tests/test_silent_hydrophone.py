@@ -108,6 +108,22 @@ def test_no_minute_depends_on_how_the_record_is_cut_or_stopped(record, station, 
 
 
 @pytest.mark.parametrize("detector", ["analytic", "learned"])
+def test_a_hydrophone_without_a_number_is_as_none(stream, station, detector):
+    """As `Stream.merge(fill_value=nan)` leaves one that never recorded."""
+    broken = stream.copy()
+    for trace in broken.select(channel="BDH"):
+        trace.data = np.full(trace.stats.npts, np.nan, np.float32)
+    run = obsnet.detect(broken, station, RunConfig(detector=detector), endtime=CPA)
+    alone = obsnet.detect(
+        stream, station.without("XX.SIM01.00.BDH"), RunConfig(detector=detector), endtime=CPA
+    )
+    assert run.maps["azimuth"].attrs["ambiguity_deg"] == 180
+    assert run.detections["azimuth_deg"].notna().any()
+    pd.testing.assert_frame_equal(run.detections, alone.detections)
+    assert "never works" in run.info["waveforms"]["left_aside"]["XX.SIM01.00.BDH"]
+
+
+@pytest.mark.parametrize("detector", ["analytic", "learned"])
 def test_polarisation_is_what_the_horizontals_alone_say_where_it_is_asked_for(stream, station, detector):
     end = CPA
     asked = RunConfig(detector=detector, azigram=AzigramConfig(method="polarisation"))

@@ -205,7 +205,8 @@ def calibrate_waveforms(
     stated = {channel.azimuth_deg for channel in station.horizontals}
     if len(station.horizontals) == 2 and (None in stated or len(stated) == 1):
         station = station.calibrated(orientation_deg=0.0)  # any will do to begin with
-    source = open_waveforms(waveforms, station, starttime=starttime, endtime=endtime)
+    rate_hz = settings.spectra.analysis_rate_hz
+    source = open_waveforms(waveforms, station, starttime=starttime, endtime=endtime, min_rate_hz=rate_hz)
 
     def blocks() -> Iterator[xr.Dataset]:
         for block in iter_spectra(source, settings.spectra):
@@ -214,6 +215,7 @@ def calibrate_waveforms(
                 done = to_posix(block["time"].values[-1]) - source.begin_ns / 1e9
                 progress(float(done), (source.end_ns - source.begin_ns) / 1e9)
 
+    station = source.station
     return calibrate(blocks(), station, tracks, propagation_table(settings.ocean, station.depth_m), config)
 
 

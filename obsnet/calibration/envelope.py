@@ -74,8 +74,9 @@ class Branches:
         self.table = table
         self.range_m = table["range"].values.astype(float)
         self.delay = np.stack([tdoa(table, pair).values for pair in self.pairs])
+        told = self.delay.copy()
         for i in range(len(self.pairs)):
-            close = np.any(np.abs(np.delete(self.delay, i, 0) - self.delay[i]) < SEPARATION_S, axis=0)
+            close = np.any(np.abs(np.delete(told, i, 0) - told[i]) < SEPARATION_S, axis=0)
             self.delay[i] = np.where(close, np.nan, self.delay[i])
         self.east_m, self.north_m = self._emitted(table)
         # The first 0.3 s hold the source's own spectrum, the clutter filter notwithstanding.

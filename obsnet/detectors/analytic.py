@@ -67,8 +67,9 @@ class AzimuthDetectorConfig:
         if not 0.0 < self.mean_resultant_length < 1.0:
             raise ConfigError(f"mean_resultant_length must lie in (0, 1), found {self.mean_resultant_length}")
         step = self.azimuth_step_deg
-        if not 0.01 <= step <= 90.0 or abs(360.0 / step - round(360.0 / step)) > 1e-9:
-            raise ConfigError(f"azimuth_step_deg must divide 360 and lie between 0.01 and 90, found {step}")
+        # azimuths known up to 180° alone are told by opposite cells that say the same
+        if not 0.01 <= step <= 90.0 or abs(180.0 / step - round(180.0 / step)) > 1e-9:
+            raise ConfigError(f"azimuth_step_deg must divide 180 and lie between 0.01 and 90, found {step}")
         if not 0.0 < self.detection_probability < 1.0:
             raise ConfigError(f"detection_probability must lie in (0, 1), found {self.detection_probability}")
         if not 0.0 < self.background_step_s <= self.background_window_s:

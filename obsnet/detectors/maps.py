@@ -69,7 +69,7 @@ def two_sided(azimuth_llr: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    azimuth_llr : (time, azimuth), the azimuths evenly around the circle.
+    azimuth_llr : (time, azimuth), the azimuths evenly around the circle; of an odd number, none has an opposite.
     """
     half, odd = divmod(azimuth_llr.shape[1], 2)
     if odd:

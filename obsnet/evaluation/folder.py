@@ -47,11 +47,12 @@ def evaluate_folder(
         raise ConfigError(
             f"ships are followed and expected to distances above 0, found {max_range_m / 1e3:g} km and {max_cpa_m / 1e3:g} km"
         )
-    detections, tracks, info = read_run(folder)
+    detections, tracks, info = _read_tables(folder)
     try:
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
         place = station["latitude"], station["longitude"]
-        delay = _delay_of_run(info["config"], station["depth_m"])
+        kept = Path(folder, info["propagation_table"]) if "propagation_table" in info else None
+        delay = _delay_of_run(info["config"], station["depth_m"], kept)
         ambiguous = info.get("azimuth_ambiguity_deg", 360) == 180
         half_known = tracks["track"].isin(info.get("ambiguous_tracks", []))
     except (KeyError, TypeError, ValueError) as error:
@@ -90,7 +91,7 @@ def _left_out(others: list[ReferenceTrack], detections: pd.DataFrame, max_cpa_m:
     ]
 
 
-def read_run(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
+def _read_tables(folder: str | Path) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
     """Detections, tracks and run.json of a folder written by ``obsnet track``.
 
     Raises
@@ -139,12 +140,12 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
 
 
-def _delay_of_run(config: dict[str, Any], depth_m: float) -> DelayFunction:
+def _delay_of_run(config: dict[str, Any], depth_m: float, kept: Path | None = None) -> DelayFunction:
     from obsnet.ocean.rays import propagation_table, travel_time
     from obsnet.pipeline import RunConfig
 
     try:
-        return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m))
+        return travel_time(propagation_table(build(RunConfig, config).ocean, depth_m, kept))
     except ConfigError as error:
         raise LayoutError(
             f"run.json is of another version of obsnet: {error}; run obsnet track again"

@@ -6,6 +6,7 @@ Path k crosses the water column k = 1, 3, 5, … times: before it arrives it has
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from obsnet.errors import ConfigError, LayoutError
+from obsnet.errors import ConfigError, LayoutError, OutputError
 from obsnet.layout import PROPAGATION, require
 from obsnet.ocean.bottom import Bottom
 from obsnet.ocean.sound_speed import OceanConfig, SoundSpeed
@@ -142,11 +143,13 @@ def propagation(
     return _dataset(numbers, ranges, numbers[:, None] * delay, pressure, slowness, reflection, attrs)
 
 
-def propagation_table(config: OceanConfig, depth_m: float) -> xr.Dataset:
+def propagation_table(config: OceanConfig, depth_m: float, kept: Path | None = None) -> xr.Dataset:
     """Propagation table of a station: the user's own file where one is named, else by ray tracing.
 
-    Echoes are as late as `config.echo_delay_s` says.
+    Echoes are as late as `config.echo_delay_s` says. `kept` is the file of a table that was used as it is.
     """
+    if kept is not None:
+        return read_propagation(kept)
     if config.propagation_file:
         table = read_propagation(config.propagation_file)
         table.attrs.setdefault("depth_m", float(depth_m))
@@ -230,13 +233,20 @@ def read_propagation(path: str | Path) -> xr.Dataset:
 
 
 def write_propagation(table: xr.Dataset, path: str | Path) -> None:
-    """Write a propagation table as netCDF, complex values as pairs of real ones."""
+    """Write a propagation table as netCDF, complex values as pairs of real ones; `OutputError` where it cannot be."""
     require(table, PROPAGATION)
     plain = table.drop_vars([name for name in ("pressure", "reflection") if name in table])
     for name in ("pressure", "reflection"):
         if name in table:
             plain[f"{name}_real"], plain[f"{name}_imag"] = table[name].real, table[name].imag
-    plain.to_netcdf(path, engine="h5netcdf")
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        plain.to_netcdf(partial, engine="h5netcdf")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"cannot write {path}: {error.strerror or error}; make room for it") from None
 
 
 def interpolate(table: xr.Dataset, range_m: np.ndarray) -> xr.Dataset:

@@ -23,10 +23,10 @@ from obsnet.ais import ReferenceTrack
 from obsnet.detectors.maps import MARGINAL
 from obsnet.errors import LayoutError
 from obsnet.layout import iso, parse_utc, to_posix
-from obsnet.run import Run, read_run, track_of_row
+from obsnet.run import Run, read_run
 from obsnet.serve.geometry import circle, ship_shape, track_shape
 from obsnet.strips import Axis, columns, plain
-from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS
+from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS, track_of_row
 from obsnet.trackers.track import Track
 
 DATABASE = "obsnet.sqlite"

@@ -18,7 +18,10 @@ from obsnet.layout import SPECTRA, require
 
 @dataclass(frozen=True)
 class AzigramConfig:
-    """Frequency band [Hz], averaging in frames, and the estimator (`auto`: intensity where there is a hydrophone)."""
+    """Frequency band [Hz], averaging in frames, and the estimator (`auto`: intensity where there is a hydrophone).
+
+    Averages are of whole records: a run, which takes them block by block, has none.
+    """
 
     fmin_hz: float = 11.0
     fmax_hz: float = 24.0

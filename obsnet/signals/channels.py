@@ -80,6 +80,7 @@ class ChannelSpectra:
             with np.errstate(invalid="ignore"):  # a frame with infinite samples becomes NaN
                 np.multiply(transform(cut), factor, out=out[chosen])
             self._turn(out[chosen], late[chosen])
+        dead |= ~np.isfinite(out[:, 0])  # one sample that is no number spoils every bin
         out[dead | stuck] = complex(np.nan, np.nan)
         report = self._source.report.channels[channel.seed_id]
         report.usable_frames += int((~(dead | stuck)).sum())

@@ -62,14 +62,14 @@ def per_minute(frames: xr.DataArray, minutes: np.ndarray, step: float) -> xr.Dat
     edges = np.searchsorted(times, np.append(minutes - step / 2, minutes[-1] + step / 2))
     values = frames.values
     valid = ~np.isnan(values[0])
-    total = np.concatenate(
-        [np.zeros((len(values), 1), values.dtype), np.cumsum(np.where(valid, values, 0), axis=1)], axis=1
-    )
     count = np.concatenate([[0], np.cumsum(valid)])
     number = count[edges[1:]] - count[edges[:-1]]
+    full = np.diff(edges) > 0
+    # each sum by itself: differences of a running one lose what is quiet after what was loud
+    total = np.add.reduceat(np.where(valid, values, 0)[:, : edges[-1]], edges[:-1][full], axis=1)
+    mean = np.full((len(values), len(minutes)), np.nan, np.result_type(values, number))
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (total[:, edges[1:]] - total[:, edges[:-1]]) / number
-    mean[:, number == 0] = np.nan
+        mean[:, full] = total / number[full]
     dim = frames.dims[0]
     return xr.DataArray(
         mean,

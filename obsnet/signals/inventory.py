@@ -90,8 +90,8 @@ def find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, 
     return sorted(found[wanted[0]], key=lambda item: seconds(item.start_date, -math.inf)), network, name
 
 
-def depth_m(station: Any, full: str) -> float:
-    """Depth of the sea floor: minus the elevation."""
+def require_depth(station: Any, full: str) -> None:
+    """Raise `StationError` where the elevation is not that of a sea floor."""
     if station.elevation is None:
         raise StationError(f"{full} has no elevation in its StationXML; give its depth (--depth)")
     elevation = float(station.elevation)
@@ -99,7 +99,6 @@ def depth_m(station: Any, full: str) -> float:
         raise StationError(
             f"{full} has an elevation of {elevation:g} m, not below 0; give its depth (--depth)"
         )
-    return -elevation
 
 
 def seconds(time: Any, default: float) -> float:

@@ -10,6 +10,7 @@ hydrophone (H) before a gauge (F, G).
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -92,6 +93,21 @@ class Channel:
 
 
 @dataclass(frozen=True)
+class Site:
+    """Where a station lay from a time [s since 1970] on: degrees in WGS 84, and the depth of the sea floor [m]."""
+
+    starttime: float
+    latitude: float
+    longitude: float
+    depth_m: float
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Latitude, longitude and depth."""
+        return self.latitude, self.longitude, self.depth_m
+
+
+@dataclass(frozen=True)
 class Station:
     """An ocean-bottom station.
 
@@ -107,6 +123,8 @@ class Station:
         The channels in use: at most one pressure channel and one motion sensor; the module says how chosen.
     epochs : tuple of Channel
         Every usable channel of every epoch, location and band; what `at` chooses from.
+    sites : tuple of Site
+        Where it lay, in order of time; what `placed` chooses from.
 
     Examples
     --------
@@ -121,6 +139,7 @@ class Station:
     depth_m: float
     channels: tuple[Channel, ...] = ()
     epochs: tuple[Channel, ...] = field(default=(), repr=False)
+    sites: tuple[Site, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if not (-90 <= self.latitude <= 90 and -180 <= self.longitude <= 360):
@@ -155,7 +174,8 @@ class Station:
         code : str, optional
             "NET.STA" (or "STA" where that is unique); may be left out if there is only one station.
         time : datetime64, ISO text or UTCDateTime, optional
-            Keep only the epochs in force at this time. By default the times of the waveforms decide.
+            Keep only the epochs in force at this time, and the place of then. By default the times of the
+            waveforms decide; until they are known, the place is the latest.
         orientation_deg : float, optional
             Azimuth of the first horizontal (N, 1, X, else the lower code), overriding the metadata. The
             others keep their angle to it; where the metadata give none, the second is 90° clockwise of the
@@ -185,14 +205,12 @@ class Station:
             )
         if time is not None:
             epochs = _in_force(epochs, time, full)
-        last = station[-1]
-        made = cls(
-            full,
-            float(last.latitude if latitude is None else latitude),
-            float(last.longitude if longitude is None else longitude),
-            inventories.depth_m(last, full) if depth_m is None else float(depth_m),
-            epochs=epochs,
-        )
+            begins = [inventories.seconds(item.start_date, -math.inf) for item in station]
+            station = [station[_last_begun(begins, inventories.seconds(time, 0.0))]]
+        sites = tuple(_site(item, latitude, longitude, depth_m) for item in station)
+        if depth_m is None:
+            inventories.require_depth(station[-1], full)
+        made = cls(full, *sites[-1].place, epochs=epochs, sites=sites)
         return made.calibrated(orientation_deg=orientation_deg, hydrophone_polarity=hydrophone_polarity).at()
 
     @property
@@ -242,6 +260,25 @@ class Station:
         pressure = _choose_pressure([c for c in pool.values() if c.kind == "pressure"], motion)
         return replace(self, channels=(*pressure, *motion))
 
+    @property
+    def moved(self) -> bool:
+        """Whether it lay in several places."""
+        return len({site.place for site in self.sites}) > 1
+
+    def placed(self, time: float) -> Station:
+        """The station where it lay at a time [s since 1970]: in the last place that it had by then, else the first.
+
+        Raises
+        ------
+        StationError
+            Its depth there is not known.
+        """
+        if not self.moved:
+            return self
+        site = self.sites[_last_begun([site.starttime for site in self.sites], time)]
+        latitude, longitude, depth_m = site.place
+        return replace(self, latitude=latitude, longitude=longitude, depth_m=depth_m)
+
     def calibrated(
         self,
         *,
@@ -264,13 +301,14 @@ class Station:
                 replace(c, polarity=hydrophone_polarity) if c.kind == "pressure" else c for c in epochs
             )
         chosen = {(c.seed_id, c.starttime) for c in self.channels}
+        given = {"latitude": latitude, "longitude": longitude, "depth_m": depth_m}
+        place: dict[str, Any] = {name: float(value) for name, value in given.items() if value is not None}
         return replace(
             self,
-            latitude=self.latitude if latitude is None else float(latitude),
-            longitude=self.longitude if longitude is None else float(longitude),
-            depth_m=self.depth_m if depth_m is None else float(depth_m),
+            **place,
             channels=tuple(c for c in epochs if (c.seed_id, c.starttime) in chosen),
             epochs=epochs,
+            sites=tuple(replace(site, **place) for site in self.sites),
         )
 
 
@@ -298,6 +336,21 @@ def _channels(station: Any, full: str) -> list[Channel]:
             )
         )
     return made
+
+
+def _site(item: Any, latitude: float | None, longitude: float | None, depth_m: float | None) -> Site:
+    """An epoch's place, or what was given in its stead; a depth that is not known is not above 0."""
+    return Site(
+        inventories.seconds(item.start_date, -math.inf),
+        float(item.latitude if latitude is None else latitude),
+        float(item.longitude if longitude is None else longitude),
+        -float(item.elevation or 0.0) if depth_m is None else float(depth_m),
+    )
+
+
+def _last_begun(starts: list[float], time: float) -> int:
+    """Which of several consecutive epochs was the last to begin by a time; the first where none had."""
+    return max(bisect_right(starts, time) - 1, 0)
 
 
 def _in_force(epochs: tuple[Channel, ...], time: Any, full: str) -> tuple[Channel, ...]:

@@ -32,7 +32,10 @@ _CHECKED_S = 60.0
 
 @dataclass
 class ChannelReport:
-    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last four."""
+    """What became of one channel; times ISO 8601, durations in s. The spectra fill in the last four.
+
+    Frames are dead where samples stand still or are no numbers.
+    """
 
     sampling_rate: float
     starttime: str
@@ -85,6 +88,7 @@ class WaveformSource:
     Attributes
     ----------
     station : Station
+        Placed where it lay when the record begins.
     timelines : dict of Timeline
         By SEED id, for the channels that can serve.
     begin_ns, end_ns : int
@@ -111,6 +115,21 @@ class WaveformSource:
         if self.begin_ns >= last or self.end_ns <= first:
             found = f"they span {_iso(first)} to {_iso(last)}"
             raise WaveformError(f"{station.code} has no waveforms {_span(begin_ns, end_ns)}; {found}")
+        if station.moved:
+            self._place()
+
+    def _place(self) -> None:
+        runs = (run for timeline in self.timelines.values() for run in timeline.runs)
+        heard = min(max(run.begin_ns, self.begin_ns) for run in runs if run.end_ns > self.begin_ns)
+        self.station = placed = self.station.placed(heard / _SECOND)
+        here, end = (placed.latitude, placed.longitude, placed.depth_m), min(self.end_ns, self.data_end_ns)
+        for site in placed.sites:
+            if heard < site.starttime * _SECOND < end and site.place != here:
+                self.report.note(
+                    f"{placed.code} lies elsewhere from {iso(site.starttime)} on: where it lay when the record "
+                    "begins is used throughout; use the parts by themselves (--start, --end)"
+                )
+                return
 
     def covered(self, silence_ns: int) -> list[tuple[int, int]]:
         """Spans that any channel covers, silences of up to `silence_ns` included; ns since 1970."""

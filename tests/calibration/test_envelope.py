@@ -132,6 +132,19 @@ def test_paths_that_the_table_lacks_are_left_out(table):
     assert branches.pairs == ("1-3", "3-5")
 
 
+def test_pairs_that_cannot_be_told_apart_are_not_read_any_of_them(table):
+    """Echoes of two pairs at one lag are of neither, whichever pair comes first."""
+    pairs = ("1-3", "3-5", "5-7", "7-9", "9-11")
+    delay = np.stack([tdoa(table, pair).values for pair in pairs])
+    apart = np.abs(delay[:, None] - delay[None])
+    apart[np.arange(len(pairs)), np.arange(len(pairs))] = np.inf
+    close = (apart < 0.15).any(axis=1)
+    assert close[0].any() and close[-1].any()
+    for order in (slice(None), slice(None, None, -1)):
+        branches = Branches(simulated(table, (0.0, 0.0)), table, pairs[order])
+        np.testing.assert_array_equal(np.isnan(branches.delay[order]), close | ~(delay >= 0.3))
+
+
 def test_too_few_frames_say_nothing(table):
     given = simulated(table, (0.0, 0.0))
     given.heard.alone[10:] = False

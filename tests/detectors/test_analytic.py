@@ -245,7 +245,13 @@ def test_model_amplitude_follows_table_ii():
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"window_s": 100.0}, {"azimuth_step_deg": 7.0}, {"mean_resultant_length": 1.0}]
+    "arguments",
+    [
+        {"window_s": 100.0},
+        {"azimuth_step_deg": 7.0},
+        {"azimuth_step_deg": 8.0},  # no azimuth has an opposite, by which those known up to 180° are told
+        {"mean_resultant_length": 1.0},
+    ],
 )
 def test_wrong_parameters_are_refused(arguments):
     with pytest.raises(ConfigError):

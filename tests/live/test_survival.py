@@ -171,7 +171,7 @@ def test_another_configuration_begins_a_new_record(live, small, hour, tmp_path):
     live().run(Ring(made[:600], {}))
     before = rows(tmp_path / "live")
     said = []
-    other = small.__class__(**{**small.__dict__, "azimuth": small.azimuth.__class__(azimuth_step_deg=8.0)})
+    other = small.__class__(**{**small.__dict__, "azimuth": small.azimuth.__class__(azimuth_step_deg=6.0)})
     running = live(config=other, say=said.append)
     assert "a new record begins" in said[0]
     running.run(Ring(made, running.resume), once=True)

@@ -42,6 +42,17 @@ def inventory(channels, code="RR03", network="YV", elevation=-4340.0):
     return Inventory([Network(network, [station])])
 
 
+def deployments():
+    """A station that lay at 20° S in 2012, 4000 m deep, and at 25° S in 2014, 2000 m deep."""
+    made = []
+    for year, latitude, depth_m in ((2012, -20.0, 4000.0), (2014, -25.0, 2000.0)):
+        span = {"start": obspy.UTCDateTime(year, 1, 1), "end": obspy.UTCDateTime(year + 1, 1, 1)}
+        (network,) = inventory([channel("BDH", **span)], elevation=-depth_m)
+        network[0].latitude, network[0].start_date, network[0].end_date = latitude, *span.values()
+        made += network.stations
+    return Inventory([Network("YV", made)])
+
+
 def trace(data, code="BDH", *, rate=50.0, start=START, location="00", station="RR03", network="YV"):
     header = {
         "network": network, "station": station, "location": location, "channel": code,

@@ -207,9 +207,12 @@ def test_one_lost_sample_is_a_gap():
 def test_nan_samples_are_a_gap():
     item = Tones(5).trace()
     item.data[5000] = np.nan
-    got = np.isnan(spectra(item, P)["p"].values)
+    source = open_waveforms(item, P)
+    got = np.isnan(spectra(source, P)["p"].values)
     assert 1 <= got.all(axis=0).sum() <= 2
     np.testing.assert_array_equal(got.all(axis=0), got.any(axis=0))
+    report = source.report.channels["YV.RR03.00.BDH"]
+    assert (report.usable_frames, report.dead_frames) == ((~got[0]).sum(), got[0].sum())
 
 
 def test_a_silence_of_years_is_passed_over():

@@ -11,11 +11,15 @@ from obspy.core.inventory import Inventory
 from obsnet.errors import StationError
 from obsnet.signals.station import Channel, Station
 
-from .conftest import channel, inventory, standard
+from .conftest import channel, deployments, inventory, standard
 
 
 def codes(station):
     return [c.code for c in station.channels]
+
+
+def place(station):
+    return station.latitude, station.longitude, station.depth_m
 
 
 def test_a_file_and_an_inventory_say_the_same(xml):
@@ -124,6 +128,38 @@ def test_epochs_follow_time():
     # an override reaches every epoch
     turned = station.calibrated(orientation_deg=50.0)
     assert turned.at(turn.timestamp - 1).orientation_deg == 50.0
+
+
+def test_the_place_follows_time():
+    made = deployments()
+    first, second = (-20.0, 54.2, 4000.0), (-25.0, 54.2, 2000.0)
+    station = Station.from_stationxml(made)
+    assert place(station) == second  # nothing says when: the latest
+    assert place(station.placed(obspy.UTCDateTime(2012, 6, 1).timestamp)) == first
+    assert place(station.placed(obspy.UTCDateTime(2013, 6, 1).timestamp)) == first
+    assert place(station.placed(obspy.UTCDateTime(2014, 6, 1).timestamp)) == second
+    assert place(station.placed(0.0)) == first
+    for time, expected in (("2012-06-01", first), ("2014-06-01", second)):
+        timed = Station.from_stationxml(made, time=time)
+        assert place(timed) == expected
+        assert place(timed.placed(0.0)) == expected  # the time has decided
+
+
+def test_a_place_that_is_given_holds_for_all_times():
+    early = obspy.UTCDateTime(2012, 6, 1).timestamp
+    given = Station.from_stationxml(deployments(), latitude=1.0, longitude=2.0, depth_m=500.0)
+    assert place(given.placed(early)) == (1.0, 2.0, 500.0)
+    shallow = Station.from_stationxml(deployments()).calibrated(depth_m=500.0)
+    assert place(shallow.placed(early)) == (-20.0, 54.2, 500.0)
+
+
+def test_a_depth_that_was_not_known_is_asked_for_only_where_it_is_needed():
+    made = deployments()
+    made[0][0].elevation = 3.0
+    station = Station.from_stationxml(made)
+    assert station.depth_m == 2000.0
+    with pytest.raises(StationError, match="give its depth"):
+        station.placed(obspy.UTCDateTime(2012, 6, 1).timestamp)
 
 
 def test_the_code_may_be_left_out_or_shortened_where_that_is_unique():

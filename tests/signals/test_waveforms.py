@@ -12,7 +12,7 @@ from obsnet.errors import WaveformError
 from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms, to_ns
 
-from .conftest import START, channel, inventory, standard, trace
+from .conftest import START, channel, deployments, inventory, standard, trace
 
 STATION = Station.from_stationxml(inventory(standard()))
 BDH = "YV.RR03.00.BDH"
@@ -293,3 +293,23 @@ def test_times_of_every_kind_are_one():
         START.timestamp,
     ):
         assert to_ns(time) == expected
+
+
+def test_a_station_lies_where_it_lay_when_its_record_begins():
+    station = Station.from_stationxml(deployments())
+    early, late = (trace(noise(3000), start=obspy.UTCDateTime(year, 6, 1)) for year in (2012, 2014))
+    both = obspy.Stream([early, late])
+
+    def found(stream, **span):
+        source = open_waveforms(stream, station, **span)
+        return source.station.latitude, source.station.depth_m, source.report.notes
+
+    first, second = (-20.0, 4000.0, []), (-25.0, 2000.0, [])
+    assert found(early) == found(both, endtime="2013-01-01") == first
+    assert found(late) == found(both, starttime="2013-06-01") == second
+    *place, notes = found(both)
+    assert place == [-20.0, 4000.0]
+    assert notes == [
+        "YV.RR03 lies elsewhere from 2014-01-01T00:00:00Z on: where it lay when the record begins is used "
+        "throughout; use the parts by themselves (--start, --end)"
+    ]
