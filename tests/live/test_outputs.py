@@ -10,8 +10,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from obsnet.errors import OutputError
+from obsnet.live.health import Health
 from obsnet.live.outputs import HealthServer, NmeaOutput, metrics, sentences
-from obsnet.live.station import Health
 
 ROW = {
     "time": "2013-05-21T11:02:00Z", "existence": 0.98, "azimuth_deg": 149.93, "azimuth_std_deg": 1.0, "range_m": 6032.2,
@@ -120,7 +120,7 @@ def test_health_and_metrics(live, hour):
 
 def test_silence_is_trouble(monkeypatch):
     now = [1000.0]
-    monkeypatch.setattr("obsnet.live.station.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("obsnet.live.health.time.monotonic", lambda: now[0])
     health = Health(silence_s=300.0)
     health.heard()
     now[0] += 299
