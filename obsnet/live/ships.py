@@ -72,8 +72,8 @@ class LiveEstimate:
         distance, distance_std = tracker.range_m
         longitude, latitude = self._local(east, north, inverse=True)
         values = (
-            round(existence, 4), round(bearing, 2), round(bearing_std, 2), round(distance, 1), round(distance_std, 1),
-            round(math.degrees(math.atan2(east_rate, north_rate)) % 360.0, 1), round(math.hypot(east_rate, north_rate), 2),
+            round(existence, 4), round(bearing, 2) % 360.0, round(bearing_std, 2), round(distance, 1), round(distance_std, 1),
+            round(math.degrees(math.atan2(east_rate, north_rate)) % 360.0, 1) % 360.0, round(math.hypot(east_rate, north_rate), 2),
             round(longitude, 6), round(latitude, 6),
         )  # fmt: skip
         return dict(zip(LIVE_COLUMNS, (iso(time), *values), strict=True))
