@@ -29,7 +29,9 @@ from obsnet.signals.waveforms import ChannelReport, WaveformReport, match_channe
 _SECOND = 1_000_000_000
 _EARLIEST_NS, _LATEST_NS = 0, 7_258_118_400 * _SECOND
 _RATE_TOLERANCE = 1e-3
-_DAY_NS, _LONGEST_NS = 86400 * _SECOND, 600 * _SECOND
+_DAY_NS = 86400 * _SECOND
+LONGEST_NS = 600 * _SECOND
+"""Longest packet that is reckoned with in what is late; ns."""
 MOST_PACKETS = 20_000
 """Packets of one channel that wait for the station's clock; more can only be nonsense."""
 
@@ -99,7 +101,7 @@ class WaveformBuffer:
         if kept.seed_id not in self.timelines:
             self.timelines[kept.seed_id] = Timeline([])
             self.report.channels[kept.seed_id] = ChannelReport(kept.rate, iso(kept.start_ns / 1e9), "")
-        self.longest_ns = max(self.longest_ns, min(kept.end_ns - kept.start_ns, _LONGEST_NS))
+        self.longest_ns = max(self.longest_ns, min(kept.end_ns - kept.start_ns, LONGEST_NS))
         self._advance_clock(kept)
         return kept
 
