@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import random
 import resource
 import sys
@@ -19,13 +17,13 @@ import pandas as pd
 
 import obsnet
 from obsnet import strips
-from obsnet.config import to_dict
 from obsnet.console import counted
 from obsnet.errors import ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.live.buffer import WaveformBuffer
 from obsnet.live.config import WatchConfig
 from obsnet.live.files import Files, rounded
+from obsnet.live.fingerprint import fingerprint
 from obsnet.live.health import Health
 from obsnet.live.packets import Packet
 from obsnet.live.ships import LiveEstimate, Ships
@@ -72,6 +70,7 @@ class LiveStation:
         self.station, self.config, self.folder, self._say = station, config, folder, say
         self._amplitudes = amplitudes
         self.pipeline = Pipeline(station, config, amplitudes, table)
+        self.fingerprint = fingerprint(station, config, self.pipeline.models, self.pipeline.table, amplitudes)
         self.store = Store(folder)
         self.buffer = WaveformBuffer(station, config.spectra, config.live)
         self.ships = Ships(self.store, station, config, self.pipeline.table)
@@ -324,16 +323,6 @@ class LiveStation:
                 self._say(str(error))
 
     # --- going on after a stop ---
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of all that the stored memory depends on."""
-        place = (self.station.code, self.station.latitude, self.station.longitude, self.station.depth_m)
-        config = {key: value for key, value in to_dict(self.config).items() if key != "live"}
-        said = json.dumps(
-            [obsnet.__version__, place, config, self.pipeline.models], sort_keys=True, default=str
-        )
-        return hashlib.sha256(said.encode()).hexdigest()
 
     def _restore(self) -> None:
         position, snapshot = self.store.noted("position"), self.store.noted("snapshot")
