@@ -29,7 +29,9 @@ from obsnet.signals.waveforms import ChannelReport, WaveformReport, match_channe
 _SECOND = 1_000_000_000
 _EARLIEST_NS, _LATEST_NS = 0, 7_258_118_400 * _SECOND
 _RATE_TOLERANCE = 1e-3
-_DAY_NS, _LONGEST_NS = 86400 * _SECOND, 600 * _SECOND
+_DAY_NS = 86400 * _SECOND
+LONGEST_NS = 600 * _SECOND
+"""Longest packet that is reckoned with in what is late; ns."""
 MOST_PACKETS = 20_000
 """Packets of one channel that wait for the station's clock; more can only be nonsense."""
 
@@ -47,6 +49,7 @@ class WaveformBuffer:
 
     Attributes
     ----------
+    begin_ns : samples before this belong to the record before; ns since 1970.
     longest_ns : length of the longest packet, ten minutes at most.
     next_frame : first frame that is not taken yet, in hops since 1970; None until the station's first.
     head_ns, newest : newest sample that the station believes in, of any channel and of each; ns since 1970.
@@ -60,6 +63,7 @@ class WaveformBuffer:
         self.timelines: dict[str, Timeline] = {}
         self.counts: Counter[str] = Counter()
         self.newest: dict[str, int] = {}
+        self.begin_ns: int | None = None
         self.head_ns: int | None = None
         self.next_frame: int | None = None
         self.covered_ns: int | None = None
@@ -79,7 +83,7 @@ class WaveformBuffer:
     def floor_ns(self) -> int | None:
         """Samples before this were needed by frames that are taken already."""
         if self.next_frame is None:
-            return None
+            return self.begin_ns
         return (self.next_frame - 1) * self.spectra.hop_ns + self.spectra.window_ns + self._margin_ns
 
     def station_at(self, time_ns: int) -> Station:
@@ -99,7 +103,7 @@ class WaveformBuffer:
         if kept.seed_id not in self.timelines:
             self.timelines[kept.seed_id] = Timeline([])
             self.report.channels[kept.seed_id] = ChannelReport(kept.rate, iso(kept.start_ns / 1e9), "")
-        self.longest_ns = max(self.longest_ns, min(kept.end_ns - kept.start_ns, _LONGEST_NS))
+        self.longest_ns = max(self.longest_ns, min(kept.end_ns - kept.start_ns, LONGEST_NS))
         self._advance_clock(kept)
         return kept
 
@@ -160,26 +164,42 @@ class WaveformBuffer:
             if self.head_ns is None or end - self.head_ns <= _DAY_NS:
                 self.head_ns = max(self.head_ns or 0, end)
 
-    def ready(self, ended: bool = False) -> tuple[int, int]:
-        """First and one-past-last frame that can be taken now; all that there are when the waveforms have `ended`."""
+    def ready(self, ended: bool = False) -> list[tuple[int, int]]:
+        """Ranges of frames (first, one past the last) that can be taken now; all there are when the waveforms have `ended`.
+
+        Between two ranges lies a silence that is too long to have rows.
+        """
         if self.head_ns is None:
-            return 0, 0
+            return []
         hop, window = self.spectra.hop_ns, self.spectra.window_ns
         half = round(0.5 / self.spectra.analysis_rate_hz * _SECOND)
         latency = round(self.live.latency_s * _SECOND) + self.longest_ns
         if self.next_frame is None:
             begin = self._first_ns(self.head_ns)
             if not ended and self.head_ns - begin < latency + window:
-                return 0, 0
+                return []
             self.next_frame = -(-(begin - half) // hop)
             self.covered_ns = begin
-        self._skip_silence()
         if ended:
             last = (self.head_ns + half - window) // hop + 1
         else:
             settled = max(self.head_ns - latency, self._complete_ns())
             last = (settled - self._margin_ns - window) // hop + 1
-        return self.next_frame, max(last, self.next_frame)
+        return self._ranges(self.next_frame, last, half)
+
+    def _ranges(self, first: int, last: int, half_ns: int) -> list[tuple[int, int]]:
+        """Frames from `first` up to `last` within the data, to half a sample; shorter silences are data."""
+        assert self.head_ns is not None and self.covered_ns is not None
+        hop, window = self.spectra.hop_ns, self.spectra.window_ns
+        ranges, until = [], self.covered_ns
+        spans = ((p.start_ns, p.end_ns) for packets in self._packets.values() for p in packets)
+        for start, end in sorted(span for span in spans if span[0] <= self.head_ns):
+            if start - until > SILENCE_NS:
+                self.report.note(f"nothing from {iso(until / 1e9)} to {iso(start / 1e9)}: passed over")
+                ranges.append((first, min(last, (until + half_ns - window) // hop + 1)))
+                first = max(first, -(-(start - half_ns) // hop))
+            until = max(until, end)
+        return [(begin, end) for begin, end in (*ranges, (first, last)) if begin < end]
 
     def _first_ns(self, head_ns: int) -> int:
         """Start of the waveforms that lead to the station's clock: a packet dated days before them is nonsense."""
@@ -191,18 +211,6 @@ class WaveformBuffer:
                 break
             first = start
         return first
-
-    def _skip_silence(self) -> None:
-        """Go on at the next samples after a silence that is too long to have rows."""
-        assert self.next_frame is not None and self.covered_ns is not None
-        following = [starts[0] for starts in self._starts.values() if starts]
-        head = self.head_ns or 0
-        begin = min((start for start in following if start <= head), default=self.covered_ns)
-        if begin - self.covered_ns > SILENCE_NS:
-            half = round(0.5 / self.spectra.analysis_rate_hz * _SECOND)
-            self.report.note(f"nothing from {iso(self.covered_ns / 1e9)} to {iso(begin / 1e9)}: passed over")
-            self.next_frame = max(self.next_frame, -(-(begin - half) // self.spectra.hop_ns))
-            self.covered_ns = begin
 
     def _complete_ns(self) -> int:
         """Time up to which every channel of the station holds all samples."""
@@ -235,6 +243,7 @@ class WaveformBuffer:
     def position(self) -> dict[str, Any]:
         """Where the station is, in plain values; its packets are stored apart."""
         return {
+            "begin_ns": self.begin_ns,
             "next_frame": self.next_frame,
             "head_ns": self.head_ns,
             "covered_ns": self.covered_ns,
@@ -243,16 +252,20 @@ class WaveformBuffer:
             "counts": dict(self.counts),
         }
 
+    def begin_after(self, position: dict[str, Any]) -> None:
+        """Begin a record where another one's `position` was; nothing has been added yet."""
+        self.begin_ns, self.next_frame = position.get("begin_ns"), position["next_frame"]
+        self.begin_ns, self.next_frame = self.floor_ns, None
+
     def restore(self, frame: int, channels: list[str], position: dict[str, Any]) -> None:
-        """Go on from a frame, the packets kept since then having been added."""
+        """Go on from a frame, `channels` having served up to it and the packets kept since then having been added."""
         self.next_frame = frame
         for name in ("head_ns", "covered_ns", "longest_ns"):
             setattr(self, name, position[name])
         self.newest, self.counts = dict(position["newest"]), Counter(position["counts"])
+        self.timelines = {seed_id: Timeline([]) for seed_id in channels}
         for seed_id in channels:
-            if seed_id not in self.timelines:
-                self.timelines[seed_id] = Timeline([])
-                self.report.channels[seed_id] = ChannelReport(0.0, "", "")
+            self.report.channels.setdefault(seed_id, ChannelReport(0.0, "", ""))
 
     def forget(self) -> None:
         """Drop the packets that no later frame needs."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
@@ -102,11 +101,3 @@ def address(text: str, schemes: tuple[str, ...], name: str) -> tuple[str, str, i
         pass
     wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes).replace("http://", "")
     raise ConfigError(f"{name} must be {wanted}, found {text!r}")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a host name or address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

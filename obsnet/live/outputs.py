@@ -40,8 +40,8 @@ def sentences(row: dict[str, Any], talker: str = "RA") -> list[str]:
         row.get(name) for name in ("range_m", "azimuth_deg", "speed_mps", "course_deg")
     )
     said = [
-        f"{talker}TTM,01,{_number(distance, 1 / 1852.0, 2)},{_number(bearing, 1.0, 1)},T,{_number(speed, 1 / _KNOT_MPS, 1)},"
-        f"{_number(course, 1.0, 1)},T,,,N,,{status},,{clock},A"
+        f"{talker}TTM,01,{_number(distance, 1 / 1852.0, 2)},{_number(_around(bearing), 1.0, 1)},T,{_number(speed, 1 / _KNOT_MPS, 1)},"
+        f"{_number(_around(course), 1.0, 1)},T,,,N,,{status},,{clock},A"
     ]
     if row.get("latitude") is not None and row.get("longitude") is not None:
         place = f"{_degrees(row['latitude'], 2, 'NS')},{_degrees(row['longitude'], 3, 'EW')}"
@@ -51,6 +51,11 @@ def sentences(row: dict[str, Any], talker: str = "RA") -> list[str]:
 
 def _number(value: float | None, factor: float, digits: int) -> str:
     return "" if value is None or not math.isfinite(value) else f"{value * factor:.{digits}f}"
+
+
+def _around(degrees: float | None) -> float | None:
+    """A direction that is not 360.0 when it has been rounded to tenths."""
+    return None if degrees is None else round(degrees, 1) % 360.0
 
 
 def _degrees(value: float, width: int, letters: str) -> str:

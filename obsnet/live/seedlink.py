@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
+from obsnet.live.buffer import LONGEST_NS
 from obsnet.live.config import LiveConfig
 from obsnet.live.packets import Packet, packet_of
 from obsnet.live.sources import Queued
@@ -120,10 +121,18 @@ class SeedLinkServer(Queued):
             first = packet.seed_id not in fresh
             fresh.add(packet.seed_id)
             if first and not by_time and newest is not None and packet.start_ns > newest + _GAP_NS:
-                self.counts["renumbered"] += 1
-                self._since_ns = min(self._newest.values())
-                return
+                heard = self._heard_until(packet.start_ns)
+                if newest in heard:
+                    self.counts["renumbered"] += 1
+                    self._since_ns = min(heard)
+                    return
             self._sequence = item.seqnum if item.seqnum is not None else self._sequence
             if len(self._newest) < 1000:
                 self._newest[packet.seed_id] = max(packet.end_ns, newest or 0)
             yield packet
+
+    def _heard_until(self, before_ns: int) -> list[int]:
+        """Newest samples before a time of the channels that are alive: what others lack nobody can use any more."""
+        newest = [end for end in self._newest.values() if end < before_ns]
+        reach = round(self._live.latency_s * _SECOND) + LONGEST_NS
+        return [end for end in newest if end >= max(newest) - reach]

@@ -72,8 +72,8 @@ class LiveEstimate:
         distance, distance_std = tracker.range_m
         longitude, latitude = self._local(east, north, inverse=True)
         values = (
-            round(existence, 4), round(bearing, 2), round(bearing_std, 2), round(distance, 1), round(distance_std, 1),
-            round(math.degrees(math.atan2(east_rate, north_rate)) % 360.0, 1), round(math.hypot(east_rate, north_rate), 2),
+            round(existence, 4), round(bearing, 2) % 360.0, round(bearing_std, 2), round(distance, 1), round(distance_std, 1),
+            round(math.degrees(math.atan2(east_rate, north_rate)) % 360.0, 1) % 360.0, round(math.hypot(east_rate, north_rate), 2),
             round(longitude, 6), round(latitude, 6),
         )  # fmt: skip
         return dict(zip(LIVE_COLUMNS, (iso(time), *values), strict=True))
@@ -108,6 +108,31 @@ class Ships:
         """Take up what the store holds."""
         self._presence = self._store.presence()
         self._closed = float(self._store.noted("closed", -math.inf))
+        self._behind = self._store.noted("behind", {"track": 0, "live": 0})
+
+    def forget(self) -> None:
+        """Drop what segments to come would need of the minutes so far; within a transaction."""
+        for table in ("presence", "tiles"):
+            self._store.execute(f"DELETE FROM {table}")
+        self._store.forget_arrays("grid")
+        self._store.execute("DELETE FROM state WHERE name = 'grid'")
+        self.reread()
+
+    def leave_behind(self) -> None:
+        """Times begin anew: what was said so far is neither before nor beside what comes; within a transaction."""
+        ((track,),) = self._store.rows("SELECT coalesce(max(track), 0) FROM tracks")
+        ((live,),) = self._store.rows("SELECT coalesce(max(rowid), 0) FROM live")
+        self._store.note("behind", {"track": track, "live": live})
+        self._store.execute("DELETE FROM state WHERE name = 'closed'")
+        self.reread()
+
+    def heard_now(self) -> dict[str, Any] | None:
+        """The last row of `live`, by when it was written: a clock that was set back leaves later times before it."""
+        rows = self._store.rows(
+            f"SELECT {', '.join(LIVE_COLUMNS)} FROM live WHERE rowid > ? ORDER BY rowid DESC LIMIT 1",
+            (self._behind["live"],),
+        )
+        return dict(zip(LIVE_COLUMNS, rows[0], strict=True)) if rows else None
 
     def keep(self, minutes: Minutes) -> None:
         """Write what a segment to come may need; within a transaction."""
@@ -138,12 +163,8 @@ class Ships:
     def search(self, segment: Segment) -> list[Track]:
         """Tracks in a segment, in order of their CPA."""
         run = self._run(segment)
-        near = [
-            track
-            for track in self.tracks(segment.start - 2 * 86400.0)
-            if track.end > segment.start - NEIGHBOUR_S
-        ]
-        found = segment_tracks(run, segment, travel_time(self._table), near, self._config.live.threads)
+        near, delay = self.neighbours(segment), travel_time(self._table)
+        found = segment_tracks(run, segment, delay, near, self._config.live.threads)
         return sorted(found, key=lambda track: track.motion.cpa_time)
 
     def say(self, segment: Segment, tracks: list[Track]) -> None:
@@ -156,11 +177,14 @@ class Ships:
         self._store.note("closed", segment.end)
         self._closed = segment.end
 
-    def tracks(self, since: float = -math.inf) -> list[Track]:
-        """Tracks said so far that end after a time, in order of their numbers."""
-        rows = self._store.rows("SELECT said FROM courses ORDER BY track")
-        found = (_track(json.loads(said)) for (said,) in rows)
-        return [track for track in found if track.end >= since]
+    def tracks(self, after: int = 0) -> list[Track]:
+        """Tracks said so far, after a number, in order of their numbers."""
+        rows = self._store.rows("SELECT said FROM courses WHERE track > ? ORDER BY track", (after,))
+        return [_track(json.loads(said)) for (said,) in rows]
+
+    def neighbours(self, segment: Segment) -> list[Track]:
+        """Tracks that may still be heard in a segment."""
+        return [t for t in self.tracks(self._behind["track"]) if t.end > segment.start - NEIGHBOUR_S]
 
     def _run(self, segment: Segment) -> Run:
         store, config = self._store, self._config

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import random
 import resource
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -20,13 +17,15 @@ import pandas as pd
 
 import obsnet
 from obsnet import strips
-from obsnet.config import to_dict
+from obsnet.config import build, to_dict
 from obsnet.console import counted
 from obsnet.errors import ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.live.buffer import WaveformBuffer
 from obsnet.live.config import WatchConfig
 from obsnet.live.files import Files, rounded
+from obsnet.live.fingerprint import fingerprint
+from obsnet.live.health import Health
 from obsnet.live.packets import Packet
 from obsnet.live.ships import LiveEstimate, Ships
 from obsnet.live.sources import Source
@@ -72,6 +71,7 @@ class LiveStation:
         self.station, self.config, self.folder, self._say = station, config, folder, say
         self._amplitudes = amplitudes
         self.pipeline = Pipeline(station, config, amplitudes, table)
+        self.fingerprint = fingerprint(station, config, self.pipeline.models, self.pipeline.table, amplitudes)
         self.store = Store(folder)
         self.buffer = WaveformBuffer(station, config.spectra, config.live)
         self.ships = Ships(self.store, station, config, self.pipeline.table)
@@ -82,6 +82,7 @@ class LiveStation:
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
         self.health = Health(config.live.silence_s)
         self._builder: SpectraBuilder | None = None
+        self._channels: list[str] = []
         self._pending: list[Packet] = []
         self._snapshot_frame: int | None = None
         self._rested = time.monotonic()
@@ -127,9 +128,9 @@ class LiveStation:
             self._late_since = time.monotonic()
         if packets:
             self.health.heard()
-        first, last = self.buffer.ready()
-        if last > first and last >= self._wanted():
-            self._advance(first, last, patient)
+        ranges = self.buffer.ready()
+        if ranges and ranges[-1][1] >= self._wanted():
+            self._advance(ranges, patient)
         if self._pending:
             self._lasting(self._keep_pending, patient)
         if self._late_since is not None and time.monotonic() - self._late_since > _BEHIND_S:
@@ -138,9 +139,7 @@ class LiveStation:
     def finish(self) -> None:
         """Say what is left when the record has ended; what a longer record would change is said again then."""
         self.buffer.believe_all()
-        first, last = self.buffer.ready(ended=True)
-        if last > first:
-            self._advance(first, last, patient=False)
+        self._advance(self.buffer.ready(ended=True), patient=False)
         if self.buffer.next_frame is None:
             return
         self._lasting(self._snapshot, patient=False)
@@ -154,16 +153,6 @@ class LiveStation:
         self._lasting(lambda: self.store.note("provisional", [last_track, closed]), patient=False)
         self._close_segments(ended=True, patient=False)
 
-    def begin_anew(self, why: str, patient: bool = True) -> None:
-        """Close the record and start another, as after a silence that is too long to have rows."""
-        self._say(why)
-        self._publish(self.pipeline.flush(), patient)
-        self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
-        self.buffer = WaveformBuffer(self.station, self.config.spectra, self.config.live)
-        self._builder, self._snapshot_frame, self._pending = None, None, []
-        self._late_since = None
-        self._lasting(self._forget, patient)
-
     # --- frames ---
 
     def _wanted(self) -> int:
@@ -174,29 +163,25 @@ class LiveStation:
         centre = following + self.config.azimuth.window_s / 2 - spectra.hop_s
         return int(np.ceil((centre - spectra.window_s / 2) / spectra.hop_s - 1e-6)) + 1
 
-    def _advance(self, first: int, last: int, patient: bool) -> None:
-        for begin, end, boundary in self._cuts(first, last):
-            finished = self._push(begin, end, patient)
-            self._publish(finished, patient, boundary)
+    def _advance(self, ranges: list[tuple[int, int]], patient: bool) -> None:
+        for first, last in ranges:
+            if self._builder is not None and first > (self.buffer.next_frame or 0):
+                self._end_record(patient)
+            for begin, end, boundary in self._cuts(first, last):
+                self.buffer.take(end)
+                finished = self._take_up_channels(begin) + self._push(begin, end)
+                self._publish(finished, patient, boundary)
+                self._close_segments(patient=patient)
         self.buffer.forget()
-        self._close_segments(patient=patient)
 
-    def _push(self, begin: int, end: int, patient: bool = True) -> list[Minutes]:
-        self.buffer.take(end)
-        if self._builder is None or self._channels != self.buffer.seen:
-            self._make_builder(begin, patient)
+    def _push(self, begin: int, end: int) -> list[Minutes]:
         assert self._builder is not None
         return self.pipeline.push(self._builder.block(np.arange(begin, end)))
 
-    def _make_builder(self, frame: int, patient: bool) -> None:
-        """Fix which channels serve; one that appears late begins a new record if it changes what is known."""
-        before = None if self._builder is None else set(self._builder.units)
+    def _build(self, frame: int) -> None:
+        """Fix which channels serve from a frame on."""
         self._channels = self.buffer.seen
         self._builder = SpectraBuilder(self.buffer, self.config.spectra, frame, frame + _FOREVER)
-        if before is not None and before != set(self._builder.units):
-            self._publish(self.pipeline.flush(), patient)
-            self._say(f"channels are now {', '.join(self._channels)}: a new record begins")
-            self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
 
     def _cuts(self, first: int, last: int) -> Iterator[tuple[int, int, bool]]:
         """Ranges of frames that end where a snapshot may be taken."""
@@ -268,24 +253,13 @@ class LiveStation:
         assert frame is not None
         self.store.put_arrays("pipeline", self.pipeline.state())
         self.store.put_arrays("estimate", self.estimate.state())
-        self.store.note(
-            "snapshot", {"frame": frame, "fingerprint": self.fingerprint, "channels": self.buffer.seen}
-        )
+        made = {"fingerprint": self.fingerprint, "config": to_dict(self.config)}
+        self.store.note("snapshot", {"frame": frame, "channels": self._channels} | made)
         self.store.forget_packets(self.buffer.needed_ns)
         self._snapshot_frame, self._rested = frame, time.monotonic()
 
-    def _forget(self) -> None:
-        for room in ("pipeline", "estimate"):
-            self.store.forget_arrays(room)
-        self.store.execute("DELETE FROM packets")
-        self.store.execute("DELETE FROM state WHERE name IN ('snapshot', 'grid', 'provisional')")
-        self.store.execute("DELETE FROM tiles")
-        self.store.execute("DELETE FROM presence")
-        self.store.note("position", self._position())
-        self.ships.reread()
-
     def _position(self) -> dict[str, Any]:
-        return self.buffer.position() | {"source": self.source.position if self.source else {}}
+        return self.buffer.position() | {"source": self.source.position if self.source else self.resume}
 
     def _lasting(self, write: Callable[[], None], patient: bool) -> None:
         """Commit, if need be again and again: a full disk is waited for, and nothing is taken meanwhile."""
@@ -307,14 +281,15 @@ class LiveStation:
                     raise
                 wait = min(2 * wait, self.config.live.retry_max_s)
 
-    def _close_segments(self, ended: bool = False, patient: bool = True) -> None:
-        for segment in self.ships.close(ended):
+    def _close_segments(self, ended: bool = False, patient: bool = True, ships: Ships | None = None) -> None:
+        ships = ships or self.ships
+        for segment in ships.close(ended):
             try:
-                tracks = self.ships.search(segment)
+                tracks = ships.search(segment)
             except ObsnetError as error:
                 self._say(f"the segment from {iso(segment.start)} to {iso(segment.end)} is left: {error}")
                 tracks = []
-            self._lasting(lambda s=segment, t=tracks: self.ships.say(s, t), patient)  # type: ignore[misc]
+            self._lasting(lambda s=segment, t=tracks: ships.say(s, t), patient)  # type: ignore[misc]
             self._look()
             if tracks:
                 self._say(f"{counted(len(tracks), 'track')} from {iso(segment.start)} to {iso(segment.end)}")
@@ -323,27 +298,75 @@ class LiveStation:
             except OutputError as error:
                 self._say(str(error))
 
-    # --- going on after a stop ---
+    # --- where a record ends, begins, or goes on after a stop ---
+    #
+    # A record is what one memory has heard. Other channels begin another memory, in the commit of the first frames that it
+    # heard; ships go on. A silence that is too long to have rows ends the ships, too. So do other settings, after which a
+    # record begins where the former one was left; and a clock that was set back, after which times come that were before.
 
-    @property
-    def fingerprint(self) -> str:
-        """Digest of all that the stored memory depends on."""
-        place = (self.station.code, self.station.latitude, self.station.longitude, self.station.depth_m)
-        config = {key: value for key, value in to_dict(self.config).items() if key != "live"}
-        said = json.dumps(
-            [obsnet.__version__, place, config, self.pipeline.models], sort_keys=True, default=str
-        )
-        return hashlib.sha256(said.encode()).hexdigest()
+    def begin_anew(self, why: str, patient: bool = True) -> None:
+        """Close the record and start another, whose times may lie anywhere."""
+        self._say(why)
+        if self.buffer.next_frame is not None:
+            self._advance(self.buffer.ready(ended=True), patient)
+            self._end_record(patient)
+        self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
+        self.estimate = LiveEstimate(self.station)
+        self.buffer = WaveformBuffer(self.station, self.config.spectra, self.config.live)
+        self._builder, self._channels, self._snapshot_frame, self._pending = None, [], None, []
+        self._late_since = None
+
+        def write() -> None:
+            self._forget()
+            self.ships.leave_behind()
+
+        self._lasting(write, patient)
+        self._look()
+
+    def _take_up_channels(self, frame: int) -> list[Minutes]:
+        """Have the channels serve that have come; where they change what is known, the minutes of the memory before."""
+        if self._builder is not None and self._channels == self.buffer.seen:
+            return []
+        before = None if self._builder is None else set(self._builder.units)
+        self._build(frame)
+        self._snapshot_frame = None
+        assert self._builder is not None
+        if before is None or before == set(self._builder.units):
+            return []
+        self._say(f"channels are now {', '.join(self._channels)}: a new record begins")
+        finished = self.pipeline.flush()
+        self.pipeline = Pipeline(self.station, self.config, self._amplitudes, self.pipeline.table)
+        return finished
+
+    def _end_record(self, patient: bool) -> None:
+        """Say what is left of the record, its ships too; what comes next is kept as the beginning of another."""
+        self._publish(self.pipeline.flush(), patient)
+        self._close_segments(ended=True, patient=patient)
+        self._lasting(self.ships.forget, patient)
+        self._snapshot_frame = None
+
+    def _forget(self) -> None:
+        """Drop from the store what the next frame of a record would depend on."""
+        for room in ("pipeline", "estimate"):
+            self.store.forget_arrays(room)
+        self.store.execute("DELETE FROM packets")
+        self.store.execute("DELETE FROM state WHERE name IN ('snapshot', 'provisional')")
+        self.store.note("position", self._position())
+        self.ships.forget()
 
     def _restore(self) -> None:
         position, snapshot = self.store.noted("position"), self.store.noted("snapshot")
         self.resume = (position or {}).get("source", {})
         if snapshot is None or position is None:
+            if position is not None:
+                self.buffer.begin_after(position)
             for packet in self.store.packets():
                 self.buffer.add(packet)
             return
         if snapshot["fingerprint"] != self.fingerprint:
             self._say("station, configuration or version changed: a new record begins")
+            self._close_former(snapshot)
+            self.buffer.begin_after(position)
             with self.store.transaction():
                 self._forget()
             return
@@ -354,13 +377,28 @@ class LiveStation:
             self.buffer.add(packet)
         self.buffer.restore(snapshot["frame"], snapshot["channels"], position)
         self._snapshot_frame = snapshot["frame"]
-        self._channels = snapshot["channels"]
+        if snapshot["channels"]:
+            self._build(snapshot["frame"])
         until = position["next_frame"]
         for begin, end, _ in self._cuts(snapshot["frame"], until):
+            self.buffer.take(end)
             for minutes in self._push(begin, end):
                 self.estimate.step(minutes.maps)
         if until > snapshot["frame"]:
             self.buffer.forget()
+
+    def _close_former(self, snapshot: dict[str, Any]) -> None:
+        """Say the ships that were under way when other settings had been made, as those would have had it."""
+        try:
+            config = build(WatchConfig, snapshot["config"])
+            ships = Ships(self.store, self.station, config, self.pipeline.table)
+            self._close_segments(ended=True, patient=False, ships=ships)
+        except OutputError:
+            raise
+        except Exception as error:
+            # another version may have kept anything, and must not keep this one from beginning
+            what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            self._say(f"the ships that were under way are left: {what}")
 
     def _unsay_provisional(self) -> None:
         """Take back the tracks of a record that was closed and now goes on."""
@@ -381,9 +419,7 @@ class LiveStation:
     def _look(self) -> None:
         """Read from the store what `status` tells of it."""
         ((tracks,),) = self.store.rows("SELECT count(*) FROM tracks")
-        live = self.store.rows(f"SELECT {', '.join(LIVE_COLUMNS)} FROM live ORDER BY time DESC LIMIT 1")
-        row = dict(zip(LIVE_COLUMNS, live[0], strict=True)) if live else None
-        self._known: dict[str, Any] = {"live": row, "tracks": tracks}
+        self._known: dict[str, Any] = {"live": self.ships.heard_now(), "tracks": tracks}
 
     def tell(self) -> None:
         """Rewrite status.json."""
@@ -421,49 +457,4 @@ class LiveStation:
             "left_aside": dict(list(dict(self.buffer.report.left_aside).items())[:20]),
             **self._known,
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale, 1),
-        }
-
-
-class Health:
-    """What a station remembers of its last hour, to say whether it is well."""
-
-    def __init__(self, silence_s: float) -> None:
-        self.trouble = ""
-        self._silence_s = silence_s
-        self._heard: float | None = None
-        self._heard_wall: float | None = None
-        self._began = time.monotonic()
-        self._coverage: deque[float] = deque(maxlen=60)
-        self.last_minute: str | None = None
-        self.minute_delay_s: float | None = None
-
-    def heard(self) -> None:
-        """A packet has come."""
-        self._heard, self._heard_wall = time.monotonic(), time.time()
-
-    def minute(self, rows: pd.DataFrame) -> None:
-        """Minutes have been said."""
-        self._coverage.extend(rows["coverage"].to_numpy(float)[-60:])
-        self.last_minute = str(rows["time"].iloc[-1])
-        if self._heard is not None:
-            self.minute_delay_s = time.monotonic() - self._heard
-
-    @property
-    def silent_s(self) -> float:
-        """Seconds since the last packet, or since the start."""
-        return time.monotonic() - (self._began if self._heard is None else self._heard)
-
-    def said(self, head_ns: int | None, source_trouble: str) -> dict[str, Any]:
-        """Health in plain values; `trouble` is empty while all is well."""
-        silent = self.silent_s > self._silence_s
-        trouble = self.trouble or source_trouble or (f"no packet for {self.silent_s:.0f} s" if silent else "")
-        return {
-            "healthy": not trouble,
-            "trouble": trouble,
-            "last_packet": None if self._heard_wall is None else iso(round(self._heard_wall)),
-            "silent_s": round(self.silent_s, 1),
-            "data_latency_s": None if head_ns is None else round(time.time() - head_ns / 1e9, 1),
-            "last_minute": self.last_minute,
-            "minute_delay_s": None if self.minute_delay_s is None else round(self.minute_delay_s, 3),
-            "coverage_last_hour": round(float(np.mean(self._coverage)), 3) if self._coverage else None,
         }

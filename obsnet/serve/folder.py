@@ -167,8 +167,10 @@ class LiveFolder(_Folder):
         except (OSError, ValueError):
             status = {}
         with self._database() as database:
-            first, last = database.execute("SELECT min(time), max(time) FROM detections").fetchone()
-        span = [_posix(first), _posix(last)] if first else [0.0, 60.0]
+            (first,) = database.execute("SELECT min(time) FROM detections").fetchone()
+            # the last one written: a clock that was set back leaves later times before it
+            last = database.execute("SELECT time FROM detections ORDER BY rowid DESC LIMIT 1").fetchone()
+        span = [_posix(first), _posix(last[0])] if last else [0.0, 60.0]
         health = {name: status[key] for key, name in HEALTH.items() if status.get(key) is not None}
         health |= {
             name: _duration(health[name]) for name in ("data latency", "a minute's delay") if name in health

@@ -4,14 +4,16 @@ import json
 import socket
 import urllib.error
 import urllib.request
+from types import SimpleNamespace
 
 import pynmea2
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from obsnet.errors import OutputError
+from obsnet.live.health import Health
 from obsnet.live.outputs import HealthServer, NmeaOutput, metrics, sentences
-from obsnet.live.station import Health
+from obsnet.live.ships import LiveEstimate
 
 ROW = {
     "time": "2013-05-21T11:02:00Z", "existence": 0.98, "azimuth_deg": 149.93, "azimuth_std_deg": 1.0, "range_m": 6032.2,
@@ -43,6 +45,29 @@ def test_no_ship_is_no_sentence_and_an_unknown_range_is_empty():
     (ttm,) = sentences({**ROW, "existence": 0.7, "range_m": None, "latitude": None, "longitude": None})
     parsed = pynmea2.parse(ttm.strip(), check=True)
     assert (parsed.distance, parsed.status) == (None, "Q")
+
+
+def test_north_is_zero_degrees_however_it_is_rounded():
+    ttm = pynmea2.parse(
+        sentences({**ROW, "azimuth_deg": 359.96, "course_deg": 359.98})[0].strip(), check=True
+    )
+    assert (float(ttm.bearing), float(ttm.cog)) == (0.0, 0.0)
+    assert (
+        ",,T,8.0,,T,"
+        in sentences({**ROW, "azimuth_deg": None, "course_deg": None, "speed_mps": 8.0 * 1852 / 3600})[0]
+    )
+
+
+def test_the_live_row_of_a_ship_in_the_north_reads_zero(station):
+    held = SimpleNamespace(
+        config=SimpleNamespace(interval_s=60.0),
+        step=lambda azimuth, chart: 0.9,
+        state=((-1e-3, 6000.0, -1e-3, 8.0), None),
+        azimuth=(359.999, 1.0),
+        range_m=(6000.0, 90.0),
+    )
+    row = LiveEstimate(station)._row(0.0, held, None, None)
+    assert (row["azimuth_deg"], row["course_deg"]) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +145,7 @@ def test_health_and_metrics(live, hour):
 
 def test_silence_is_trouble(monkeypatch):
     now = [1000.0]
-    monkeypatch.setattr("obsnet.live.station.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("obsnet.live.health.time.monotonic", lambda: now[0])
     health = Health(silence_s=300.0)
     health.heard()
     now[0] += 299

@@ -7,11 +7,13 @@ import signal
 import sqlite3
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from obsnet.live.config import LiveConfig
+from obsnet.live.packets import Packet
 from obsnet.live.seedlink import SeedLinkServer
 from obsnet.live.station import LiveStation
 
@@ -113,6 +115,34 @@ def test_silence_is_noticed_and_the_server_tried_again(live, small, ring, batch,
     assert sum("No data for over" in words for words in told) >= 2
     station.finish()
     assert differences(rows(tmp_path / "live"), rows(batch)) == []
+
+
+NOW_NS = 1_700_000_000 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("ends_s", "first", "start_s", "asked_s"),
+    [
+        ({"BDH": -90 * 86400, "BHZ": 0, "BH1": -20}, "BHZ", 5, -20),  # one is dead: the others' time
+        ({"BDH": -90 * 86400, "BHZ": 0, "BH1": -20}, "BDH", 5, None),  # it is back, and nothing was lost
+        ({"BDH": -90 * 86400, "BHZ": -40, "BH1": -30}, "BHZ", 3 * 86400, -40),  # the server was away for days
+        ({"BDH": 400 * 86400, "BHZ": 0, "BH1": -20}, "BHZ", 5, -20),  # nonsense was dated far ahead
+    ],
+)
+def test_a_server_that_counts_anew_is_asked_since_what_the_living_channels_lack(
+    monkeypatch, ends_s, first, start_s, asked_s
+):
+    class Connection:
+        def collect(self, reconnect):
+            yield SimpleNamespace(payload=b"", seqnum=6)
+
+    ends = {f"XX.SIM01..{channel}": NOW_NS + s * 10**9 for channel, s in ends_s.items()}
+    source = SeedLinkServer("127.0.0.1", 1, "XX.SIM01", QUICK, {"sequence": 5, "newest": ends})
+    packet = Packet(f"XX.SIM01..{first}", NOW_NS + start_s * 10**9, 50.0, np.zeros(500, int))
+    monkeypatch.setattr("obsnet.live.seedlink.packet_of", lambda payload: packet)
+    got = list(source._received(Connection()))
+    assert source._since_ns == (None if asked_s is None else NOW_NS + asked_s * 10**9)
+    assert got == ([packet] if asked_s is None else [])
 
 
 def test_waits_grow_by_chance_up_to_a_limit():
