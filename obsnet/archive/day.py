@@ -89,15 +89,15 @@ def table_of(config: RunConfig, depth_m: float) -> xr.Dataset:
     return propagation_table(config.ocean, depth_m)
 
 
-def known_station(ledger: Ledger, code: str) -> Station:
-    """A station of the archive."""
+def known_station(ledger: Ledger, code: str, time: float) -> Station:
+    """A station of the archive, where it lies at a time [s since 1970]."""
     path = ledger.station_file(code)
-    return station_of(str(path), path.stat().st_mtime_ns)
+    return station_of(str(path), path.stat().st_mtime_ns).placed(time)
 
 
 def _detect(task: DayTask, ledger: Ledger) -> dict[str, Any]:
     day, config = task.day, task.config
-    station = known_station(ledger, day.code)
+    station = known_station(ledger, day.code, day.start)
     reach = config.azimuth.window_s + config.spectra.window_s
     source = open_waveforms(
         task.waveforms, station, starttime=day.start - config.memory_s, endtime=day.start + DAY_S + reach,

@@ -116,7 +116,7 @@ def track_name(code: str, found: Track) -> str:
 
 def _rows(task: TracksTask, ledger: Ledger) -> pd.DataFrame:
     code, config = task.day.code, task.config
-    station = known_station(ledger, code)
+    station = known_station(ledger, code, min(s.start for s in task.segments))
     first = np.floor(min(s.start for s in task.segments) / DAY_S)
     last = np.floor(max(s.end for s in task.segments) / DAY_S)
     days = [Day(code, iso(DAY_S * number)[:10]) for number in np.arange(first, last + 1)]

@@ -25,7 +25,7 @@ from obsnet.signals.spectra import SpectraConfig
 
 WINDOW_S, STEP_S = 180.0, 60.0
 UNUSED = {
-    "azigram": ("fmin_hz", "fmax_hz", "average_frames"),
+    "azigram": ("fmin_hz", "fmax_hz"),
     "azimuth": (
         "mean_resultant_length",
         "mode",

@@ -115,8 +115,8 @@ def quiet_until(presence: pd.DataFrame, config: SegmentationConfig = Segmentatio
 def _stretches(presence: pd.DataFrame) -> list[pd.DataFrame]:
     """Parts in regular steps, cut where times are left out as in a long silence; one, even if there is nothing."""
     apart = np.diff(presence.index.to_numpy(float))
-    cuts = np.flatnonzero(apart > 1.5 * np.median(apart)) + 1 if apart.size else []
-    return [presence.iloc[first:last] for first, last in pairwise([0, *cuts, len(presence)])]
+    cuts = np.flatnonzero(apart > 1.5 * np.median(apart)) + 1 if apart.size else np.empty(0, int)
+    return [presence.iloc[first:last] for first, last in pairwise([0, *cuts.tolist(), len(presence)])]
 
 
 def _heard(presence: pd.DataFrame, config: SegmentationConfig) -> tuple[np.ndarray, int]:

@@ -1,5 +1,6 @@
 """Station-days: as in one continuous run, never twice, and a bad one does not stop the rest."""
 
+import copy
 import json
 import os
 import shutil
@@ -18,6 +19,8 @@ import xarray as xr
 
 import obsnet
 from obsnet.archive import archive
+from obsnet.archive.day import known_station
+from obsnet.archive.ledger import Ledger
 from obsnet.config import build, merge_overrides
 from obsnet.kinematics import StraightCourse
 from obsnet.pipeline import RunConfig
@@ -211,6 +214,22 @@ def test_codes_that_lead_out_of_the_folder_are_one_line(command, sds, record, tm
     status, _, errors = command(sds, tmp_path / "deep" / "out", "--stations", evil)
     assert status == 2 and len(errors) == 1 and "has the code '../../evil'" in errors[0]
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == {evil}
+
+
+def test_a_station_lies_where_it_lay_on_the_day(record, tmp_path):
+    inventory = obspy.read_inventory(str(record / "station.xml"))
+    (early,) = inventory[0]
+    late = copy.deepcopy(early)
+    early.end_date = late.start_date = obspy.UTCDateTime(2014, 1, 1)
+    late.latitude, late.elevation = 10.0, -1000.0
+    inventory[0].stations.append(late)
+    ledger = Ledger(tmp_path)
+    path = ledger.station_file("XX.SIM01")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    inventory.write(str(path), "STATIONXML")
+    then, now = (known_station(ledger, "XX.SIM01", at.timestamp) for at in (MIDNIGHT, MIDNIGHT + 1e8))
+    assert (then.latitude, then.depth_m) == (early.latitude, -early.elevation)
+    assert (now.latitude, now.depth_m) == (10.0, 1000.0)
 
 
 def test_a_folder_that_is_no_archive_is_one_line(command, record, tmp_path):
