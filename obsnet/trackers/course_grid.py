@@ -326,12 +326,14 @@ class Shares:
     Attributes
     ----------
     ranged, pointed : sums of what range maps and azimuth maps say, in the tiles in which they speak for it.
+    net_ranged : sum of what range maps say in all tiles in which it is heard, below 0 where they deny it.
     agreeing : of the sensor that speaks for it in fewer tiles, the share of tiles in which the other does too; 1 where it is
         but one or two.
     """
 
     ranged: float
     pointed: float
+    net_ranged: float
     agreeing: float
 
 
@@ -341,10 +343,12 @@ def shares(point: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps
     _, azimuth = score_points(point[None], tiles, delay, scores.without_range())
     first, last = best_run(both[:, 0])
     held = slice(first, last + 1)
-    pointed, ranged = (np.maximum(part[held, 0], 0.0) for part in (azimuth, both - azimuth))
+    net = (both - azimuth)[held, 0]
+    pointed, ranged = np.maximum(azimuth[held, 0], 0.0), np.maximum(net, 0.0)
     fewer = int(min((pointed > 0).sum(), (ranged > 0).sum()))
     together = int(((pointed > 0) & (ranged > 0)).sum())
-    return Shares(float(ranged.sum()), float(pointed.sum()), together / fewer if fewer > 2 else 1.0)
+    agreeing = together / fewer if fewer > 2 else 1.0
+    return Shares(float(ranged.sum()), float(pointed.sum()), float(net.sum()), agreeing)
 
 
 def other_scale(

@@ -298,7 +298,9 @@ class _Finder:
         config = self.config
         seen = np.array([True, True, self.sees_course, True])
         heard = shares(best, self.tiles, self.delay, scores)
-        silent = self.sees_course and heard.ranged < SILENT
+        # Where range maps deny what lines tell, they would lead back to the ghost that lines overruled.
+        denied = speed is not None and heard.net_ranged <= 0.0
+        silent = self.sees_course and (heard.ranged < SILENT or denied)
         if silent:
             scores = scores.without_range()
 

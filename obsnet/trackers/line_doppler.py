@@ -24,7 +24,7 @@ CHANCE = 2.0
 """Standard deviations that a pitch may stand out by chance."""
 LEAST_OF_LINES = 300.0
 """Evidence of lines, nats, below which they tell no scale of simulated ships."""
-LINES_SHARE = 0.05
+LINES_SHARE = 0.07
 """Weight of it beside what range maps say: a shaft whose rate wanders by as much as the shift moves all lines at once, in all tiles."""
 AGREED = 0.8
 """Share of the greatest evidence of lines from which on they agree to a scale: the lines of a shaft that turns unevenly fall on each
