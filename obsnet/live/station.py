@@ -339,8 +339,7 @@ class LiveStation:
         position, snapshot = self.store.noted("position"), self.store.noted("snapshot")
         self.resume = (position or {}).get("source", {})
         if snapshot is None or position is None:
-            for packet in self.store.packets():
-                self.buffer.add(packet)
+            self.buffer.take_up(self.store.packets(), position or {})
             return
         if snapshot["fingerprint"] != self.fingerprint:
             self._say("station, configuration or version changed: a new record begins")
@@ -350,8 +349,7 @@ class LiveStation:
         self._unsay_provisional()
         self.pipeline.restore(self.store.arrays("pipeline"))
         self.estimate.restore(self.store.arrays("estimate"))
-        for packet in self.store.packets():
-            self.buffer.add(packet)
+        self.buffer.take_up(self.store.packets(), position)
         self.buffer.restore(snapshot["frame"], snapshot["channels"], position)
         self._snapshot_frame = snapshot["frame"]
         self._channels = snapshot["channels"]
