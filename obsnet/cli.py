@@ -242,7 +242,7 @@ def calibrate(
     from obsnet.output import staged
 
     settings = commands.run_config(config, overrides, None, None)
-    where = commands.read_station(station, code, start, depth_m=depth)
+    where = commands.read_station(station, code, depth_m=depth)
     where = commands.placed(where, waveforms, settings, start, end)
     reference = commands.read_reference(ais, where, max_cpa_m=None, quiet=quiet)
     with staged(out) as folder:

@@ -55,7 +55,7 @@ def track(
 
     settings = run_config(config, overrides, detector, tracker, propagation)
     station, settings, amplitudes = _calibrated(
-        station_file, code, start, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+        station_file, code, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     if ais:
@@ -119,7 +119,7 @@ def watch(
             section["latency_s"] = latency
     settings = build(WatchConfig, values)
     station, settings, amplitudes = _calibrated(
-        station_file, code, None, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
+        station_file, code, calibration, settings, orientation_deg=orientation, hydrophone_polarity=hydrophone_polarity,
         depth_m=depth, latitude=latitude, longitude=longitude,
     )  # fmt: skip
     watch_source(
@@ -228,13 +228,12 @@ def _values(
     return values | {key: value for key, value in chosen.items() if value is not None}
 
 
-def read_station(path: Path, code: str | None, start: str | None, **overrides: Any) -> Station:
+def read_station(path: Path, code: str | None, **overrides: Any) -> Station:
     """The station of a StationXML; `overrides` as `Station.from_stationxml` takes them, None where not given."""
     from obsnet.signals.station import Station
 
-    return Station.from_stationxml(
-        path, code, time=start, **{key: value for key, value in overrides.items() if value is not None}
-    )
+    given = {key: value for key, value in overrides.items() if value is not None}
+    return Station.from_stationxml(path, code, **given)
 
 
 def placed(
@@ -252,13 +251,12 @@ def placed(
 def _calibrated(
     path: Path,
     code: str | None,
-    start: str | None,
     calibration: Path | None,
     config: Settings,
     **overrides: Any,
 ) -> tuple[Station, Settings, Amplitudes | None]:
     """Station, parameters and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given."""
-    station = read_station(path, code, start, **overrides)
+    station = read_station(path, code, **overrides)
     if calibration is None:
         return station, config, None
     from obsnet.calibration import Calibration

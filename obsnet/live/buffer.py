@@ -11,6 +11,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -24,7 +25,7 @@ from obsnet.signals.records import ChannelRecords, piece_of, stretches
 from obsnet.signals.spectra import SILENCE_NS, SpectraConfig
 from obsnet.signals.station import Station
 from obsnet.signals.timeline import JOIN_SAMPLES, Piece, Timeline
-from obsnet.signals.waveforms import ChannelReport, WaveformReport, match_channel
+from obsnet.signals.waveforms import ChannelReport, WaveformReport, match_channel, serving_ids
 
 _SECOND = 1_000_000_000
 _EARLIEST_NS, _LATEST_NS = 0, 7_258_118_400 * _SECOND
@@ -54,6 +55,7 @@ class WaveformBuffer:
     next_frame : first frame that is not taken yet, in hops since 1970; None until the station's first.
     head_ns, newest : newest sample that the station believes in, of any channel and of each; ns since 1970.
     timelines : of every channel seen, by SEED id.
+    heard_ids : SEED ids that usable packets had.
     counts : packets by what became of them: used, repeated, late, unknown, slow, empty, ahead.
     """
 
@@ -67,6 +69,7 @@ class WaveformBuffer:
         self.head_ns: int | None = None
         self.next_frame: int | None = None
         self.covered_ns: int | None = None
+        self.heard_ids: set[str] = set()
         self._known = {channel.seed_id for channel in station.epochs}
         self._packets: dict[str, list[Packet]] = {}
         self._starts: dict[str, list[int]] = {}
@@ -109,7 +112,7 @@ class WaveformBuffer:
 
     def _judge(self, packet: Packet) -> tuple[Packet | None, str]:
         own = match_channel(packet.seed_id, self._known)
-        if own is None:
+        if own is None or serving_ids({*self.heard_ids, packet.seed_id}, self._known)[own] != packet.seed_id:
             self.report.left_aside.setdefault(packet.seed_id[:20], "not described")
             return None, "unknown"
         if not (len(packet.samples) and packet.samples.dtype.kind in "iuf" and math.isfinite(packet.rate)):
@@ -119,6 +122,7 @@ class WaveformBuffer:
             return None, "slow"
         if not (packet.start_ns > _EARLIEST_NS and packet.end_ns < _LATEST_NS):
             return None, "empty"
+        self._hear(packet.seed_id, own)
         floor = self.floor_ns
         kept = packet if floor is None or packet.start_ns >= floor else packet.after(floor)
         if kept is None:
@@ -130,6 +134,12 @@ class WaveformBuffer:
         if len(held) >= MOST_PACKETS:
             return None, "ahead"
         return replace(kept, seed_id=own), "used"
+
+    def _hear(self, seed_id: str, own: str) -> None:
+        """Drop what still waits of another sensor that was taken for the channel until now."""
+        if seed_id not in self.heard_ids and own in serving_ids(self.heard_ids, self._known):
+            self._packets[own], self._starts[own] = [], []
+        self.heard_ids.add(seed_id)
 
     def _advance_clock(self, packet: Packet) -> None:
         """Believe a packet's time if it goes on from the others', or once its channel keeps to it."""
@@ -249,6 +259,7 @@ class WaveformBuffer:
             "covered_ns": self.covered_ns,
             "longest_ns": self.longest_ns,
             "newest": self.newest,
+            "heard_ids": sorted(self.heard_ids),
             "counts": dict(self.counts),
         }
 
@@ -256,6 +267,12 @@ class WaveformBuffer:
         """Begin a record where another one's `position` was; nothing has been added yet."""
         self.begin_ns, self.next_frame = position.get("begin_ns"), position["next_frame"]
         self.begin_ns, self.next_frame = self.floor_ns, None
+
+    def take_up(self, packets: Iterable[Packet], position: dict[str, Any]) -> None:
+        """Add packets that were kept, which bear their channels' ids whatever they came with."""
+        for packet in packets:
+            self.add(packet)
+        self.heard_ids = set(position.get("heard_ids", ()))
 
     def restore(self, frame: int, channels: list[str], position: dict[str, Any]) -> None:
         """Go on from a frame, `channels` having served up to it and the packets kept since then having been added."""

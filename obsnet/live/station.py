@@ -360,8 +360,7 @@ class LiveStation:
         if snapshot is None or position is None:
             if position is not None:
                 self.buffer.begin_after(position)
-            for packet in self.store.packets():
-                self.buffer.add(packet)
+            self.buffer.take_up(self.store.packets(), position or {})
             return
         if snapshot["fingerprint"] != self.fingerprint:
             self._say("station, configuration or version changed: a new record begins")
@@ -373,8 +372,7 @@ class LiveStation:
         self._unsay_provisional()
         self.pipeline.restore(self.store.arrays("pipeline"))
         self.estimate.restore(self.store.arrays("estimate"))
-        for packet in self.store.packets():
-            self.buffer.add(packet)
+        self.buffer.take_up(self.store.packets(), position)
         self.buffer.restore(snapshot["frame"], snapshot["channels"], position)
         self._snapshot_frame = snapshot["frame"]
         if snapshot["channels"]:

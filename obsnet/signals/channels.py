@@ -6,7 +6,7 @@ import numpy as np
 
 from obsnet.errors import StationError
 from obsnet.signals.frames import FrameTransform, clipped, constant, touched
-from obsnet.signals.response import frequency_response
+from obsnet.signals.response import described, frequency_response
 from obsnet.signals.station import Channel, Station
 from obsnet.signals.timeline import Run
 from obsnet.signals.waveforms import WaveformReport, Waveforms
@@ -128,7 +128,8 @@ def rotation(station: Station, report: WaveformReport) -> dict[str, np.ndarray]:
     Raises
     ------
     StationError
-        A horizontal of a pair has no azimuth, or the channels are not independent.
+        A horizontal of a pair has no azimuth, the channels are not independent, or counts and m/s would
+        make one direction.
     """
     motion = station.motion
     flat = [i for i, channel in enumerate(motion) if channel.horizontal]
@@ -155,4 +156,24 @@ def rotation(station: Station, report: WaveformReport) -> dict[str, np.ndarray]:
     weights = {name: np.zeros(len(motion)) for name in names}
     for name, row in zip(names, inverse, strict=True):
         weights[name][used] = row
+    for together in (("east", "north"), ("down",)):
+        _require_one_unit([
+            channel
+            for i, channel in enumerate(motion)
+            if any(weights[name][i] for name in together if name in weights)
+        ])  # fmt: skip
     return weights
+
+
+def _require_one_unit(channels: list[Channel]) -> None:
+    """Raise `StationError` where only some of the channels have a response."""
+    bare, known = (
+        [channel.seed_id for channel in channels if described(channel.response) == has]
+        for has in (False, True)
+    )
+    if bare and known:
+        lack, have = ("have" if len(ids) > 1 else "has" for ids in (bare, known))
+        raise StationError(
+            f"{' and '.join(bare)} {lack} no response, but {' and '.join(known)} {have} one: counts and m/s make no "
+            "direction together; complete the StationXML, or leave out the response of all"
+        )

@@ -201,8 +201,10 @@ class SpectraBuilder:
         for station, weights in zip(self._stations, self._rotations, strict=True):
             if station.pressure is not None:
                 self.units["p"] = "Pa" if self._known(station.pressure) else "count"
-            for name in weights:
-                self.units[name] = "m/s" if all(map(self._known, station.motion)) else "count"
+            for name, row in weights.items():
+                used = [channel for channel, weight in zip(station.motion, row, strict=True) if weight]
+                known = [self._known(channel) for channel in used]
+                self.units[name] = "m/s" if all(known) else "count"
         if not self.units:
             raise StationError(
                 f"no channel of {source.station.code} has an epoch at the time of its waveforms, "

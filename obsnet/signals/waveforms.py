@@ -163,8 +163,8 @@ def open_waveforms(
         Files in any format that obspy reads (pickles excepted), folders (searched to any depth), wildcards,
         SDS archives.
     station : Station
-        Whose channels to look for. A file that differs from it in nothing but a location code, or an empty
-        network code, is taken to be the station's, and the report says so.
+        Whose channels to look for. Waveforms that differ from a channel in nothing but a location code, or
+        an empty network code, are taken for it where it has none of its own, and the report says so.
     starttime, endtime : optional
         datetime64, ISO text, UTCDateTime or s since 1970.
     min_rate_hz : float
@@ -297,18 +297,21 @@ def _sort(
     known = {channel.seed_id for channel in station.epochs}
     pieces: dict[str, list[Piece]] = {}
     for seed_id, piece in found:
-        own = match_channel(seed_id, known)
-        if own is None:
+        if match_channel(seed_id, known) is None:
             report.left_aside[seed_id] = f"not described for {station.code}"
         elif not _EARLIEST_NS < piece.start_ns < _LATEST_NS:
             report.left_aside[seed_id] = "dated outside 1900 to 2200"
         elif piece.rate < min_rate_hz * (1 - _RATE_TOLERANCE):
             report.left_aside[seed_id] = f"sampled at {piece.rate:g} Hz, below the {min_rate_hz:g} Hz needed"
         else:
-            if own != seed_id:
-                report.note(f"{seed_id} taken for {own}")
-            pieces.setdefault(own, []).append(piece)
-    return {seed_id: Timeline(pieces[seed_id]) for seed_id in sorted(pieces)}
+            pieces.setdefault(seed_id, []).append(piece)
+    serving = serving_ids(pieces, known)
+    for own, seed_id in serving.items():
+        if own != seed_id:
+            report.note(f"{seed_id} taken for {own}")
+    for seed_id in sorted(pieces.keys() - serving.values()):
+        report.left_aside[seed_id] = f"not described for {station.code}"
+    return {own: Timeline(pieces[serving[own]]) for own in sorted(serving)}
 
 
 def match_channel(seed_id: str, known: set[str]) -> str | None:
@@ -324,6 +327,19 @@ def match_channel(seed_id: str, known: set[str]) -> str | None:
         and network in ("", other.split(".")[0])
     ]
     return alike[0] if len(alike) == 1 else None
+
+
+def serving_ids(found: Iterable[str], known: set[str]) -> dict[str, str]:
+    """Which of the SEED ids found serves as each of the station's channels: its own, else the first alike.
+
+    Two locations are two sensors: they are never mixed.
+    """
+    serving: dict[str, str] = {}
+    for seed_id in sorted(found, key=lambda seed_id: (seed_id not in known, seed_id)):
+        own = match_channel(seed_id, known)
+        if own is not None:
+            serving.setdefault(own, seed_id)
+    return serving
 
 
 def _nothing(what: str, station: Station, report: WaveformReport, span: str) -> str:

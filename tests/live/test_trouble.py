@@ -102,6 +102,34 @@ def test_packets_of_nonsense_move_nothing(live, hour, batch, tmp_path):
     assert differences(rows(tmp_path / "live"), rows(batch)) == []
 
 
+def of_location(packet, code):
+    network, station, _, channel = packet.seed_id.split(".")
+    return replace(packet, seed_id=f"{network}.{station}.{code}.{channel}")
+
+
+def test_a_sensor_that_is_not_described_is_not_mixed_in(live, hour, batch, tmp_path):
+    """Nor does what waits of it stay, once the described one comes."""
+    rng = np.random.default_rng(7)
+    made = in_order(hour)
+    noise = [replace(of_location(p, "10"), samples=rng.integers(-999, 999, len(p.samples))) for p in made]
+    batches = by_eight([p for pair in zip(noise, made, strict=True) for p in pair])
+    station = live()
+    station.run(Given([noise[:8], *batches]), once=True)
+    assert differences(rows(tmp_path / "live"), rows(batch)) == []
+    assert station.buffer.report.left_aside["XX.SIM01.10.BDH"] == "not described"
+
+
+def test_another_location_code_serves_where_it_is_the_only_one(live, hour, batch, tmp_path):
+    """And goes on to after a restart."""
+    made = [of_location(packet, "") for packet in in_order(hour)]
+    for some in (made[:4], made[4:400], made[400:]):
+        station = live()
+        for packets_of_eight in by_eight(some):
+            station.take(packets_of_eight)
+    station.finish()
+    assert differences(rows(tmp_path / "live"), rows(batch)) == []
+
+
 def test_bytes_of_nonsense_between_records(record):
     data = (record / "waveforms.mseed").read_bytes()[: 60 * 4096]
     rng = np.random.default_rng(1)

@@ -194,6 +194,27 @@ def test_a_location_code_or_network_code_that_differs_is_forgiven_and_said():
         open_waveforms(trace(noise(3000), location="07"), two)
 
 
+@pytest.mark.parametrize("foreign", [{"location": ""}, {"location": "10"}, {"network": ""}])
+@pytest.mark.parametrize("late", [-3600.0, 0.0, 3600.0])
+def test_beside_the_described_channel_no_other_is_taken_for_it(foreign, late):
+    """Whichever begins first, lies first in the file or fills the other's silence."""
+    data, other = noise(3000), trace(noise(400_000, seed=1), start=START + late, **foreign)
+    for stream in ([trace(data), other], [other, trace(data)]):
+        source = open_waveforms(obspy.Stream(stream), STATION)
+        same(source, [(START, data)])
+        assert source.report.left_aside == {other.id: "not described for YV.RR03"}
+        assert not source.report.notes
+
+
+def test_of_several_that_could_stand_for_a_channel_one_does():
+    data = noise(3000)
+    other = trace(noise(9000, seed=1), start=START - 60, location="20")
+    source = open_waveforms(obspy.Stream([other, trace(data, location="10")]), STATION)
+    same(source, [(START, data)])
+    assert source.report.left_aside == {"YV.RR03.20.BDH": "not described for YV.RR03"}
+    assert source.report.notes == ["YV.RR03.10.BDH taken for YV.RR03.00.BDH"]
+
+
 @pytest.mark.parametrize("form", ["MSEED", "SAC"])
 def test_a_file_that_vanishes_is_a_gap(tmp_path, form):
     path = tmp_path / "record"
