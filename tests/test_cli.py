@@ -205,7 +205,11 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
         ),
         (["--end", "2012-01-01"], "no waveforms before 2012-01-01"),
         (["--end", "2013-05-21T10:00:10Z"], "no whole frame"),
-        (["--end", "2013-05-21T10:00:50Z"], "no minute of XX.SIM01"),
+        (
+            ["--start", "2013-05-21T10:00:02Z", "--end", "2013-05-21T10:00:52Z"],
+            "no minute of XX.SIM01 from 2013-05-21T10:00:02Z to 2013-05-21T10:00:52Z: 50 s of waveforms are too short; "
+            "give at least 101 s",
+        ),
         (
             ["--detector", "magic"],
             "detector must be one of learned, analytic, learned-azimuth, learned-range, found 'magic'",
@@ -224,7 +228,21 @@ def test_a_span_in_a_gap(refused, stream, tmp_path):
     start = stream[0].stats.starttime
     (stream.slice(start, start + 1800) + stream.slice(start + 5400)).write(str(tmp_path / "w.mseed"), "MSEED")
     span = ("--start", str(start + 2400), "--end", str(start + 4800))
-    assert "no minute of XX.SIM01" in refused(*span, waveforms=tmp_path / "w.mseed")
+    line = refused(*span, waveforms=tmp_path / "w.mseed")
+    assert "no minute of XX.SIM01" in line and "BH1: 2400 s of gaps, 0 dead" in line
+
+
+def test_a_short_record_in_a_long_span(refused, stream, tmp_path):
+    start = stream[0].stats.starttime
+    stream.slice(start + 605, start + 635).write(str(tmp_path / "w.mseed"), "MSEED")
+    line = refused("--start", start, waveforms=tmp_path / "w.mseed")
+    assert ": 30.02 s of waveforms are too short; give at least 101 s" in line
+
+
+def test_one_horizontal_alone(refused, stream, tmp_path):
+    stream.select(channel="BH1").write(str(tmp_path / "w.mseed"), "MSEED")
+    line = refused(waveforms=tmp_path / "w.mseed")
+    assert "neither two horizontals nor a hydrophone" in line and "XX.SIM01.00.BH1 alone" in line
 
 
 @pytest.mark.parametrize(
