@@ -175,7 +175,7 @@ def twice(network):
         (azimuths(None), "BH1 has no azimuth in its StationXML; give --orientation"),
         (azimuths(0.0), "not independent; give --orientation"),
         (lambda network: setattr(network[0], "elevation", 10.0), "give its depth (--depth)"),
-        (twice, "describes 2 stations; name one of XX.SIM01, XX.SIM02"),
+        (twice, "describes 2 stations; name one with --code: XX.SIM01, XX.SIM02"),
     ],
 )
 def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, found):
@@ -189,9 +189,10 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
     ("options", "found"),
     [
         (["--code", "XX.NONE"], "has XX.SIM01, not XX.NONE"),
+        (["--code", ""], "has XX.SIM01, not empty text"),
         (["--orientation", "nan"], "must be an azimuth"),
         (["--hydrophone-polarity", "2"], "must be 1 or -1"),
-        (["--depth", "-5"], "cannot have a depth of -5 m"),
+        (["--depth", "-5"], "cannot have a depth of -5 m; give its depth below the surface, above 0"),
         (["--latitude", "100"], "cannot lie at latitude 100"),
         (["--start", "2013-05-21T12:00:00Z", "--end", "2013-05-21T11:00:00Z"], "is not before the end"),
         (["--start", "yesterday"], "cannot read the time 'yesterday'; give ISO 8601"),
@@ -370,6 +371,15 @@ def test_commands_that_cannot_be(said, tmp_path, monkeypatch, arguments, found):
     monkeypatch.chdir(tmp_path)
     assert found in said(*arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_of_several_stations_one_is_simulated(obsnet, said, inventory, tmp_path):
+    twice((changed := copy.deepcopy(inventory))[0])
+    changed.write(str(tmp_path / "s.xml"), "STATIONXML")
+    given = ("simulate", "--hours", "0.1", "--out", tmp_path / "o", "--station", tmp_path / "s.xml")
+    assert "name one with --code" in said(*given)
+    assert obsnet(*given, "--code", "XX.SIM02", "--quiet") == (0, [], [])
+    assert "XX.SIM02" in (tmp_path / "o" / "truth.json").read_text()
 
 
 def test_a_folder_that_is_no_run(said, record):
