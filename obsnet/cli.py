@@ -265,6 +265,7 @@ def simulate(
     station: Annotated[
         Path | None, typer.Option("--station", help="StationXML whose position and depth to use.")
     ] = None,
+    code: Code = None,
     start: Start = None,
     quiet: Quiet = False,
 ) -> None:
@@ -273,7 +274,7 @@ def simulate(
 
     with console.progress("simulating", quiet) as progress:
         summary = simulate_folder(
-            out, hours=hours, seed=seed, ships=ships, ais=ais, station=station, start=start, progress=progress
+            out, hours, seed, ships, ais, station=station, code=code, start=start, progress=progress
         )
     if not quiet:
         console.say(summary)

@@ -15,7 +15,8 @@ import xarray as xr
 from obsnet.errors import LayoutError
 
 _ISO_8601 = re.compile(
-    r"(?P<time>\d{4}(-\d\d(-\d\d(?P<clock>[T ]\d\d(:\d\d(:\d\d(\.\d+)?)?)?)?)?)?)"
+    r"(?P<year>\d{4})(-?(?P<ordinal>\d{3})|(?P<dash>-?)(?P<month>\d\d)((?P=dash)(?P<day>\d\d))?)?"
+    r"(?P<clock>[T ](?P<hour>\d\d)((?P<colon>:?)(?P<minute>\d\d)((?P=colon)(?P<second>\d\d(\.\d+)?))?)?)?"
     r"(\s*[Zz]|(?P<sign>[+-])(?P<hours>\d\d):?(?P<minutes>\d\d))?"
 )
 
@@ -82,11 +83,34 @@ def parse_utc(text: str) -> int:
     True
     """
     parts = _ISO_8601.fullmatch(text.strip())
-    if parts is None or (parts["sign"] and not parts["clock"]) or not 1678 <= int(text.strip()[:4]) <= 2261:
+    whole_day = parts and (parts["ordinal"] or parts["day"])
+    if (
+        parts is None
+        or not 1678 <= int(parts["year"]) <= 2261
+        or (parts["clock"] and not whole_day)
+        or (parts["sign"] and not parts["clock"])
+        or (parts["month"] and not parts["day"] and not parts["dash"])
+    ):
         raise ValueError(f"{text!r} is no ISO 8601 time of the years 1678 to 2261")
-    sign, hours, minutes = parts["sign"], int(parts["hours"] or 0), int(parts["minutes"] or 0)
-    offset_s = (-1 if sign == "-" else 1) * (3600 * hours + 60 * minutes)
-    return int(np.datetime64(parts["time"], "ns").astype(np.int64)) - offset_s * 1_000_000_000
+    time = f"{parts['hour'] or '00'}:{parts['minute'] or '00'}:{parts['second'] or '00'}"
+    ends = re.fullmatch(r"24:00:00(\.0+)?", time) is not None
+    since_midnight = np.datetime64(f"1970-01-01T{'00:00:00' if ends else time}", "ns") - np.datetime64(
+        0, "ns"
+    )
+    hours, minutes = int(parts["hours"] or 0), int(parts["minutes"] or 0)
+    offset_s = (-1 if parts["sign"] == "-" else 1) * (3600 * hours + 60 * minutes) - 86400 * ends
+    midnight = _day(parts).astype("datetime64[ns]")
+    return int((midnight + since_midnight).astype(np.int64)) - offset_s * 1_000_000_000
+
+
+def _day(parts: re.Match[str]) -> np.datetime64:
+    """Date of the parts of a time; `ValueError` where the year has no such day."""
+    if parts["ordinal"] is None:
+        return np.datetime64(f"{parts['year']}-{parts['month'] or '01'}-{parts['day'] or '01'}", "D")
+    day = np.datetime64(f"{parts['year']}-01-01", "D") + int(parts["ordinal"]) - 1
+    if str(day)[:4] != parts["year"]:
+        raise ValueError(f"{parts['year']} has no day {parts['ordinal']}")
+    return day
 
 
 def iso(time: np.datetime64 | float, milliseconds: bool = False) -> str:

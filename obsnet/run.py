@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -29,6 +30,7 @@ from obsnet.pipeline import NEEDS_FULL_AZIMUTHS, Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
+from obsnet.signals.usable import mute_hydrophone, nothing_heard
 from obsnet.signals.waveforms import WaveformSource, open_waveforms
 from obsnet.sinks import FolderSink, MemorySink, read_minutes
 from obsnet.tables import (
@@ -208,12 +210,16 @@ def _run(
             _require_minutes(sink.detections(), source, config)
             return source, pipeline, sink, *sink.close()
 
-    try:
-        source, pipeline, sink, maps, features = listen(station)
-    except _MuteHydrophone as mute:
-        station = station.without(mute.seed_id)
-        source, pipeline, sink, maps, features = listen(station)
-        source.report.left_aside[mute.seed_id] = "never works: gone on as if there were no hydrophone"
+    mute: list[str] = []
+    while True:
+        try:
+            source, pipeline, sink, maps, features = listen(station)
+            break
+        except _MuteHydrophone as found_mute:
+            mute.append(found_mute.seed_id)
+            station = station.without(mute[-1])
+    for seed_id in mute:
+        source.report.left_aside[seed_id] = "never works: gone on as if there were no hydrophone"
     found = sink.detections(), sink.presence()
     run = Run(source.station, config, maps, features, *found, [], [], pipeline.table)
     if heard is not None:
@@ -242,23 +248,12 @@ def _require_minutes(detections: pd.DataFrame, source: WaveformSource, config: R
 
     `_MuteHydrophone` where it is for the hydrophone alone.
     """
-    pressure, horizontals = source.station.pressure, source.station.horizontals
-    frames = {seed_id: channel.usable_frames for seed_id, channel in source.report.channels.items()}
-    others_work = len(horizontals) > 1 and all(frames.get(channel.seed_id) for channel in horizontals)
-    if pressure is not None and not frames.get(pressure.seed_id) and others_work:
-        raise _MuteHydrophone(pressure.seed_id)
-    if (detections["coverage"] > 0).any():
-        return
-    begin, end = (iso(ns / 1e9) for ns in (source.begin_ns, source.end_ns))
-    why = [
-        f"{seed_id}: {channel.gap_s:g} s of gaps, {channel.dead_frames} dead and {channel.clipped_frames} clipped frames"
-        for seed_id, channel in source.report.channels.items()
-    ]
-    raise WaveformError(
-        f"no minute of {source.station.code} from {begin} to {end} has usable data ("
-        + "; ".join([*why, *source.report.notes])
-        + f"); give at least {2 * config.azimuth.window_s:g} s of working channels, and leave out of the StationXML what never works"
-    )
+    if mute := mute_hydrophone(source):
+        raise _MuteHydrophone(mute)
+    if not (detections["coverage"] > 0).any():
+        # whatever the second at which it begins, this holds a minute between the centres of two frames
+        least_s = config.azimuth.step_s + config.spectra.window_s + 2 * config.spectra.hop_s
+        raise WaveformError(nothing_heard(source, len(detections), math.ceil(least_s)))
 
 
 def _stream(

@@ -175,7 +175,7 @@ def twice(network):
         (azimuths(None), "BH1 has no azimuth in its StationXML; give --orientation"),
         (azimuths(0.0), "not independent; give --orientation"),
         (lambda network: setattr(network[0], "elevation", 10.0), "give its depth (--depth)"),
-        (twice, "describes 2 stations; name one of XX.SIM01, XX.SIM02"),
+        (twice, "describes 2 stations; name one with --code: XX.SIM01, XX.SIM02"),
     ],
 )
 def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, found):
@@ -189,9 +189,10 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
     ("options", "found"),
     [
         (["--code", "XX.NONE"], "has XX.SIM01, not XX.NONE"),
+        (["--code", ""], "has XX.SIM01, not empty text"),
         (["--orientation", "nan"], "must be an azimuth"),
         (["--hydrophone-polarity", "2"], "must be 1 or -1"),
-        (["--depth", "-5"], "cannot have a depth of -5 m"),
+        (["--depth", "-5"], "cannot have a depth of -5 m; give its depth below the surface, above 0"),
         (["--latitude", "100"], "cannot lie at latitude 100"),
         (["--start", "2013-05-21T12:00:00Z", "--end", "2013-05-21T11:00:00Z"], "is not before the end"),
         (["--start", "yesterday"], "cannot read the time 'yesterday'; give ISO 8601"),
@@ -205,7 +206,11 @@ def test_stationxml_that_does_not_serve(refused, inventory, tmp_path, change, fo
         ),
         (["--end", "2012-01-01"], "no waveforms before 2012-01-01"),
         (["--end", "2013-05-21T10:00:10Z"], "no whole frame"),
-        (["--end", "2013-05-21T10:00:50Z"], "no minute of XX.SIM01"),
+        (
+            ["--start", "2013-05-21T10:00:02Z", "--end", "2013-05-21T10:00:52Z"],
+            "no minute of XX.SIM01 from 2013-05-21T10:00:02Z to 2013-05-21T10:00:52Z: 50 s of waveforms are too short; "
+            "give at least 101 s",
+        ),
         (
             ["--detector", "magic"],
             "detector must be one of learned, analytic, learned-azimuth, learned-range, found 'magic'",
@@ -224,7 +229,21 @@ def test_a_span_in_a_gap(refused, stream, tmp_path):
     start = stream[0].stats.starttime
     (stream.slice(start, start + 1800) + stream.slice(start + 5400)).write(str(tmp_path / "w.mseed"), "MSEED")
     span = ("--start", str(start + 2400), "--end", str(start + 4800))
-    assert "no minute of XX.SIM01" in refused(*span, waveforms=tmp_path / "w.mseed")
+    line = refused(*span, waveforms=tmp_path / "w.mseed")
+    assert "no minute of XX.SIM01" in line and "BH1: 2400 s of gaps, 0 dead" in line
+
+
+def test_a_short_record_in_a_long_span(refused, stream, tmp_path):
+    start = stream[0].stats.starttime
+    stream.slice(start + 605, start + 635).write(str(tmp_path / "w.mseed"), "MSEED")
+    line = refused("--start", start, waveforms=tmp_path / "w.mseed")
+    assert ": 30.02 s of waveforms are too short; give at least 101 s" in line
+
+
+def test_one_horizontal_alone(refused, stream, tmp_path):
+    stream.select(channel="BH1").write(str(tmp_path / "w.mseed"), "MSEED")
+    line = refused(waveforms=tmp_path / "w.mseed")
+    assert "neither two horizontals nor a hydrophone" in line and "XX.SIM01.00.BH1 alone" in line
 
 
 @pytest.mark.parametrize(
@@ -356,6 +375,15 @@ def test_commands_that_cannot_be(said, tmp_path, monkeypatch, arguments, found):
     monkeypatch.chdir(tmp_path)
     assert found in said(*arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_of_several_stations_one_is_simulated(obsnet, said, inventory, tmp_path):
+    twice((changed := copy.deepcopy(inventory))[0])
+    changed.write(str(tmp_path / "s.xml"), "STATIONXML")
+    given = ("simulate", "--hours", "0.1", "--out", tmp_path / "o", "--station", tmp_path / "s.xml")
+    assert "name one with --code" in said(*given)
+    assert obsnet(*given, "--code", "XX.SIM02", "--quiet") == (0, [], [])
+    assert "XX.SIM02" in (tmp_path / "o" / "truth.json").read_text()
 
 
 def test_a_folder_that_is_no_run(said, record):

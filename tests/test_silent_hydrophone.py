@@ -123,13 +123,56 @@ def test_a_hydrophone_without_a_number_is_as_none(stream, station, detector):
     assert "never works" in run.info["waveforms"]["left_aside"]["XX.SIM01.00.BDH"]
 
 
+def without_hydrophones(stream):
+    return obspy.Stream([trace for trace in stream if trace.stats.channel != "BDH"])
+
+
+def test_a_hydrophone_without_waveforms_is_said_to_have_none(stream, station, monkeypatch):
+    """And the record is listened to once."""
+    opened = []
+    monkeypatch.setattr(
+        "obsnet.run.open_waveforms",
+        lambda *given, **options: opened.append(open_waveforms(*given, **options)) or opened[-1],
+    )
+    run = obsnet.detect(without_hydrophones(stream), station, RunConfig(detector="analytic"), endtime=CPA)
+    assert len(opened) == 1
+    assert run.maps["azimuth"].attrs["ambiguity_deg"] == 180
+    assert run.info["waveforms"]["notes"] == ["XX.SIM01.00.BDH has no waveforms"]
+    assert run.info["waveforms"]["left_aside"] == {}
+
+
+def test_of_two_hydrophones_neither_need_work(stream, station):
+    """One that never works beside one that has no waveforms, and two that never work."""
+    (hydrophone,) = (channel for channel in station.epochs if channel.seed_id.endswith("BDH"))
+    gauge = replace(hydrophone, seed_id="XX.SIM01.00.BDF")
+    two = replace(station, epochs=(*station.epochs, gauge)).at()
+    (trace,) = stream.select(channel="BDH")
+    dead = [trace.copy(), trace.copy()]
+    for item, code in zip(dead, ("BDH", "BDF"), strict=True):
+        item.data, item.stats.channel = np.zeros_like(item.data), code
+    plain, config = without_hydrophones(stream), RunConfig(detector="analytic")
+    expected = obsnet.detect(plain, station, config, endtime=CPA).detections
+    for broken in (dead, dead[1:]):
+        run = obsnet.detect(plain + obspy.Stream(broken), two, config, endtime=CPA)
+        pd.testing.assert_frame_equal(run.detections, expected)
+        assert run.info["waveforms"]["left_aside"].keys() == {item.id for item in broken}
+
+
+def test_a_least_length_is_enough_wherever_it_begins(stream, station):
+    begin = stream[0].stats.starttime
+    for detector in ("analytic", "learned"):
+        for late in (0.0, 17.3, 31.0, 41.9, 50.2, 59.9):
+            part = stream.slice(begin + late, begin + late + 101.0)
+            found = obsnet.detect(part, station, RunConfig(detector=detector)).detections
+            assert (found["coverage"] > 0).any()
+
+
 @pytest.mark.parametrize("detector", ["analytic", "learned"])
 def test_polarisation_is_what_the_horizontals_alone_say_where_it_is_asked_for(stream, station, detector):
     end = CPA
     asked = RunConfig(detector=detector, azigram=AzigramConfig(method="polarisation"))
     told = obsnet.detect(stream, station, asked, endtime=end)
-    alone = obspy.Stream([trace for trace in stream if trace.stats.channel != "BDH"])
-    expected = obsnet.detect(alone, station, RunConfig(detector=detector), endtime=end)
+    expected = obsnet.detect(without_hydrophones(stream), station, RunConfig(detector=detector), endtime=end)
     assert told.maps["azimuth"].attrs["ambiguity_deg"] == 180 == told.info["azimuth_ambiguity_deg"]
     assert "range_llr" in told.maps and "range_llr" not in expected.maps
     assert told.info["notes"] == ["azimuth from polarisation, ambiguous by 180°"]

@@ -12,6 +12,7 @@ import pandas as pd
 from obsnet.errors import AISError
 
 KNOT = 1852.0 / 3600.0
+NO_LONGITUDE_DEG = 181.0
 EARLIEST = pd.Timestamp("1990-01-01")
 LATEST = pd.Timestamp("2200-01-01")
 NOT_SHIPS = ("base station", "aton", "sar airborne", "search and rescue transponder", "man overboard device")
@@ -98,6 +99,7 @@ def clean(raw: pd.DataFrame, dialect: Dialect, dropped: Counter[str]) -> pd.Data
         return pd.to_numeric(raw[name], errors="coerce").astype(float)
 
     mmsi, lon, lat = number("mmsi"), number("lon"), number("lat")
+    lon = lon.mask(lon.between(180, 360, inclusive="right") & (lon != NO_LONGITUDE_DEG), lon - 360)
     time = _times(raw["time"], dialect.time_format)
     unlike_ship = pd.Series(False, raw.index) if dialect.prepared else _shore_or_aid(mmsi)
     if "mobile" in raw:

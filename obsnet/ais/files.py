@@ -76,7 +76,7 @@ def read(
     Returns
     -------
     DataFrame
-        ``mmsi`` (int64), ``time`` (datetime64[ns], UTC), ``lon``, ``lat`` [deg], ``sog_mps`` [m/s],
+        ``mmsi`` (int64), ``time`` (datetime64[ns], UTC), ``lon`` (from -180 to 180), ``lat`` [deg], ``sog_mps`` [m/s],
         ``cog_deg``, ``heading_deg`` [deg from North], and where the file gives them ``ship_type``,
         ``length_m``, ``width_m``, ``to_stern_m`` (antenna to stern) and ``name``; sorted by ship and time,
         without duplicates and without positions that imply more than 60 knots. ``attrs["report"]`` is a

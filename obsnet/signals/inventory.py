@@ -82,10 +82,12 @@ def find(inventory: Any, code: str | None, where: str) -> tuple[list[Any], str, 
     wanted = [key for key in found if code is None or code in (key[1], ".".join(key))]
     if not wanted:
         raise StationError(
-            f"{where} describes no station" if not found else f"{where} has {names}, not {code}"
+            f"{where} describes no station"
+            if not found
+            else f"{where} has {names}, not {code or 'empty text'}"
         )
     if len(wanted) > 1:
-        raise StationError(f"{where} describes {len(wanted)} stations; name one of {names}")
+        raise StationError(f"{where} describes {len(wanted)} stations; name one with --code: {names}")
     network, name = wanted[0]
     return sorted(found[wanted[0]], key=lambda item: seconds(item.start_date, -math.inf)), network, name
 

@@ -206,6 +206,12 @@ class SpectraBuilder:
                 known = [self._known(channel) for channel in used]
                 self.units[name] = "m/s" if all(known) else "count"
         if not self.units:
+            heard = sorted({channel.seed_id for station in self._stations for channel in station.channels})
+            if heard:
+                raise StationError(
+                    f"{source.station.code} offers neither two horizontals nor a hydrophone: there are waveforms "
+                    f"of {' and '.join(heard)} alone; give those of its other channels too"
+                )
             raise StationError(
                 f"no channel of {source.station.code} has an epoch at the time of its waveforms, "
                 f"{iso(np.datetime64(int(centres[0]), 'ns'))}; give metadata of that time"

@@ -147,7 +147,8 @@ class Station:
             raise StationError(f"{self.code} cannot lie at {where}; correct its position")
         if not (math.isfinite(self.depth_m) and 0 < self.depth_m < 12000):
             raise StationError(
-                f"{self.code} cannot have a depth of {self.depth_m:g} m; give its depth (--depth)"
+                f"{self.code} cannot have a depth of {self.depth_m:g} m; give its depth below the surface, "
+                "above 0 and below 12000 m (--depth)"
             )
         if not self.epochs:
             object.__setattr__(self, "epochs", self.channels)

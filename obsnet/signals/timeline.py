@@ -196,8 +196,13 @@ class Timeline:
     @property
     def gap_s(self) -> float:
         """Seconds without samples between the first and the last."""
-        held = sum(run.end_ns - run.begin_ns for run in self.runs)
-        return max(self.end_ns - self.begin_ns - held, 0) / _SECOND
+        return self.missing_s(self.begin_ns, self.end_ns)
+
+    def missing_s(self, begin_ns: int, end_ns: int) -> float:
+        """Seconds without samples in a span of time."""
+        runs = self.between(begin_ns, end_ns)
+        held = sum(min(run.end_ns, end_ns) - max(run.begin_ns, begin_ns) for run in runs)
+        return max(end_ns - begin_ns - held, 0) / _SECOND
 
     def between(self, begin_ns: int, end_ns: int) -> list[Run]:
         """The runs that touch a span of time."""

@@ -198,6 +198,9 @@ def open_waveforms(
         raise WaveformError(_nothing(what, station, report, _span(begin, end)))
     for seed_id, timeline in timelines.items():
         report.channels[seed_id] = _describe(timeline)
+    silent = station.pressure.seed_id if station.pressure else None
+    if silent and silent not in report.left_aside and not station.at(seed_ids=timelines.keys()).pressure:
+        report.note(f"{silent} has no waveforms")
     return WaveformSource(station, timelines, report, begin, end)
 
 

@@ -157,6 +157,7 @@ def simulate_folder(
     ships: int = 1,
     ais: str | Path | None = None,
     station: str | Path | None = None,
+    code: str | None = None,
     start: str | None = None,
     progress: Progress | None = None,
 ) -> str:
@@ -171,6 +172,8 @@ def simulate_folder(
         AIS file in any dialect.
     station : path, optional
         StationXML whose code, position, depth and orientation to take; station RR03's position by default.
+    code : text, optional
+        NET.STA, where the StationXML holds several stations.
     start : text, optional
         ISO 8601 UTC; by default the record is centred on the first closest approach of the AIS.
 
@@ -191,7 +194,7 @@ def simulate_folder(
         name, value = ("seed", seed) if seed < 0 else ("number of ships", ships)
         raise ConfigError(f"the {name} must be a whole number of at least 0, found {value}")
     generator = np.random.default_rng([seed, 0x57A])
-    recorder = Recorder.random(generator, **_described(station))  # type: ignore[arg-type]
+    recorder = Recorder.random(generator, **_described(station, code))  # type: ignore[arg-type]
     begin = _seconds(start) if start else None
     if ais is None:
         begin = DEFAULT_START if begin is None else begin
@@ -206,10 +209,10 @@ def simulate_folder(
     )
 
 
-def _described(station: str | Path | None) -> dict[str, object]:
+def _described(station: str | Path | None, code: str | None) -> dict[str, object]:
     if station is None:
         return {"depth_m": Recorder.depth_m}
-    known = Station.from_stationxml(station)
+    known = Station.from_stationxml(station, code)
     angle = known.orientation_deg
     place: dict[str, object] = {
         "code": known.code,

@@ -165,7 +165,7 @@ def test_a_depth_that_was_not_known_is_asked_for_only_where_it_is_needed():
 def test_the_code_may_be_left_out_or_shortened_where_that_is_unique():
     two = Inventory([*inventory(standard()).networks, *inventory(standard(), code="RR04").networks])
     assert Station.from_stationxml(two, "RR04").code == "YV.RR04"
-    with pytest.raises(StationError, match=r"describes 2 stations; name one of YV\.RR03, YV\.RR04"):
+    with pytest.raises(StationError, match=r"describes 2 stations; name one with --code: YV\.RR03, YV\.RR04"):
         Station.from_stationxml(two)
 
 
