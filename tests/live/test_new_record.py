@@ -175,9 +175,9 @@ def test_a_ship_under_way_has_its_track_when_the_clock_is_set_back(live, hour, t
 def test_a_ship_under_way_has_its_track_when_the_configuration_changes(live, small, hour, tmp_path, section):
     """Its segment is the one that the former configuration sees, and what comes later is another record."""
     other = {
-        "azimuth": {"azimuth_step_deg": 8.0},
+        "azimuth": {"azimuth_step_deg": 6.0},
         "segmentation": SMALL["segmentation"] | {"shortest_min": 300.0},
-        "grid_search": SMALL["grid_search"] | {"tile_s": 60.0},
+        "grid_search": SMALL["grid_search"] | {"tile_s": 360.0},
     }
     made = in_order(hour)
     live().run(Ring(made[:1100], {}))
@@ -214,7 +214,7 @@ def test_a_folder_is_not_read_again_with_another_configuration(live, station, sm
     running.run(Folder(sds, station, small.live, running.buffer.floor_ns, once=True))
     before = rows(out)
     hour.slice(begin + 2400.02).write(str(sds / "b.mseed"), "MSEED")
-    other = build(type(small), SMALL | {"azimuth": {"azimuth_step_deg": 8.0}})
+    other = build(type(small), SMALL | {"azimuth": {"azimuth_step_deg": 6.0}})
     running = live(config=other)
     running = live(config=other)  # before anything came
     running.run(Folder(sds, station, small.live, running.buffer.floor_ns, once=True), once=True)
