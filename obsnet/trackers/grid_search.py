@@ -36,13 +36,13 @@ from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchCon
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 from obsnet.trackers.verdict import (
+    as_stated,
     believable,
     is_cut_off,
     is_no_remainder,
     is_one,
     is_sharp,
     required,
-    with_ghost,
 )
 
 LINGERS = 2.0
@@ -163,7 +163,7 @@ class _Finder:
             one_of_many = bool(others) or mixed
             whole = not one_of_many or (is_no_remainder(found) and not is_cut_off(found, *self._cuts))
             if pointed and believable(found, config) and whole:
-                tracks.append(with_ghost(found))
+                tracks.append(as_stated(found, config.range_scale_std if self.sees_range else 0.0))
             azimuth_llr, range_llr = self.remainder.without(found, azimuth_llr, range_llr)
             if ghosts is not None and range_llr is not None:
                 range_llr = self.remainder.without_ghosts(ghosts, range_llr)
@@ -349,9 +349,7 @@ class _Finder:
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
         }
         start, end = float(self.origin + self.tiles[lo]), float(self.origin + self.tiles[hi])
-        track = Track(
-            start, end, self._course(mean), self._of_table(cov, mean), log_bayes_factor, method, extra
-        )
+        track = Track(start, end, self._course(mean), cov, log_bayes_factor, method, extra)
         worth = log_bayes_factor >= config.min_log_bayes_factor and believable(track, config)
         if worth and self.sees_course and self.sees_range:
             track = self._bent(track, known, scores, speed)
@@ -383,7 +381,7 @@ class _Finder:
             least_of_turn=config.min_log_bayes_factor_next, samples=config.samples, seed=config.seed,
         )  # fmt: skip
         mean = found.mean
-        changes: dict[str, Any] = {"covariance": self._of_table(found.covariance, mean)}
+        changes: dict[str, Any] = {"covariance": found.covariance}
         if found.bent:
             score, per_tile = score_points(mean[None], self.tiles, self.delay, scores, reach)
             lo, hi = best_run(per_tile[:, 0])
@@ -406,11 +404,6 @@ class _Finder:
         turn_s, turn_deg = mean[TURN].tolist()
         terms = tuple(map(tuple, across)), tuple(map(tuple, along))
         return BentCourse(*state, tuple(reach.tolist()), *terms, turn_s, turn_deg)
-
-    def _of_table(self, covariance: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """The covariance with the propagation table's own error: it scales CPA range and speed alike."""
-        scaled = self.config.range_scale_std * np.array([0.0, mean[1], 0.0, mean[3]])
-        return covariance + (np.outer(scaled, scaled) if self.sees_range else 0.0)
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config

@@ -16,8 +16,8 @@ class GridSearchConfig:
     reach `min_log_bayes_factor_next`, since what is left of the first is not noise, or `min_log_bayes_factor_apart` where it is heard
     when no other is; where its CPA is located sharply, to two minutes and 500 m as remainders are not, no more than a first one. A track must be heard for
     `shortest_s`, for half of it if it is located sharply and moves.
-    `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.2 % and a depth known
-    to 0.2 % leave open in the propagation table; raise it where the profile is a guess (2 % in sound speed are 3–5 % in range). With `lines`, the Doppler shift of a ship's
+    `range_scale_std` is the relative standard deviation of all ranges together: what a sound speed known to 0.8 % leaves open in the
+    propagation table, as a profile taken for a sea that one does not know; lower it where the profile was measured (0.2 % in sound speed are 0.5 % in range). With `lines`, the Doppler shift of a ship's
     lines has a say in the scale of its distance and speed (`obsnet.trackers.line_doppler`).
     """
 
@@ -36,7 +36,7 @@ class GridSearchConfig:
     min_log_bayes_factor_apart: float = 30.0
     still_deg_per_hour: float = 4.0
     shortest_s: float = 1800.0
-    range_scale_std: float = 0.005
+    range_scale_std: float = 0.015
     lines: bool = True
     samples: int = 3000
     seed: int = 0

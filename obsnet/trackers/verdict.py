@@ -61,15 +61,17 @@ def required(track: Track, others: Sequence[Track], config: GridSearchConfig) ->
     return config.min_log_bayes_factor_apart if alone else config.min_log_bayes_factor_next
 
 
-def with_ghost(track: Track) -> Track:
-    """A track whose covariance covers the ghost for which range maps say nearly as much, if there is one.
+def as_stated(track: Track, range_scale_std: float) -> Track:
+    """A track whose covariance covers what its own maps cannot tell: by how much they scale CPA range and speed alike.
 
-    It becomes the mean square about what is stated, of a ship that is where the track is or, with probability `GHOST`, at
-    `extra["other_scale"]` times its CPA range and speed.
+    To the propagation table's own error, `range_scale_std`, comes the ghost for which range maps say nearly as much, if there is
+    one: the mean square about what is stated of a ship that, with probability `GHOST`, is at `extra["other_scale"]` times the CPA
+    range and speed. Verdicts are of a track before this: what all tracks share tells none from a remainder.
     """
     apart = track.extra.get("other_scale", 1.0) - 1.0
-    offset = apart * np.array([0.0, track.motion.cpa_range_m, 0.0, track.motion.speed_mps])
-    return replace(track, covariance=track.covariance + GHOST * np.outer(offset, offset))
+    along = np.array([0.0, track.motion.cpa_range_m, 0.0, track.motion.speed_mps])
+    variance = range_scale_std**2 + GHOST * apart**2
+    return replace(track, covariance=track.covariance + variance * np.outer(along, along))
 
 
 def is_sharp(track: Track) -> bool:

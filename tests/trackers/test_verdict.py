@@ -8,7 +8,7 @@ import pytest
 from obsnet.kinematics import StraightCourse
 from obsnet.trackers.search_config import GridSearchConfig
 from obsnet.trackers.track import Track
-from obsnet.trackers.verdict import GHOST, believable, is_cut_off, with_ghost
+from obsnet.trackers.verdict import GHOST, as_stated, believable, is_cut_off
 
 CONFIG = GridSearchConfig()
 END = 7200.0
@@ -66,9 +66,11 @@ def test_a_speed_at_the_edge_of_the_prior_must_be_known_to_lie_within(speed, std
 
 def test_a_track_with_a_ghost_is_as_uncertain_as_not_to_know_which():
     alone = track()
-    assert np.array_equal(with_ghost(alone).covariance, alone.covariance)
-    found = with_ghost(replace(alone, extra=alone.extra | {"other_scale": 2.0}))
+    assert np.array_equal(as_stated(alone, 0.0).covariance, alone.covariance)
+    found = as_stated(replace(alone, extra=alone.extra | {"other_scale": 2.0}), 0.0)
     extra = found.covariance - alone.covariance
     assert extra[1, 1] == pytest.approx(GHOST * 8000.0**2) and extra[3, 3] == pytest.approx(GHOST * 8.0**2)
     assert extra[1, 3] == pytest.approx(GHOST * 8000.0 * 8.0) and not extra[[0, 2]].any()
     assert found.motion == alone.motion
+    table = as_stated(alone, 0.02).covariance - alone.covariance
+    assert table[1, 1] == pytest.approx(160.0**2) and table[3, 3] == pytest.approx(0.16**2)
