@@ -14,9 +14,29 @@ from contextlib import suppress
 from queue import SimpleQueue
 from typing import Any
 
-from obsnet.errors import WorkerDied
+from obsnet.errors import ConfigError, WorkerDied
 
 _STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
+def usable_cores(asked: int | None = None) -> int:
+    """How many may work at a time: as many as are asked for, but no more than there are cores for this process, the default.
+
+    Raises
+    ------
+    ConfigError : fewer than one is asked for.
+    """
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        cores = os.cpu_count() or 1
+    if asked is None:
+        return cores
+    if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
+        raise ConfigError(
+            f"threads and processes must be a whole number of at least 1, or none for all cores, found {asked!r}"
+        )
+    return min(asked, cores)
 
 
 class Beside:
@@ -35,7 +55,7 @@ class Beside:
     def __init__(self, task: Generator[None, Any, None], cores: int | None = None) -> None:
         self._task = task
         self._words: deque[Any] = deque()
-        self._copy = _Copy(_work, task) if (cores or os.cpu_count() or 1) > 1 and _may_fork() else None
+        self._copy = _Copy(_work, task) if (cores or usable_cores()) > 1 and _may_fork() else None
 
     def tell(self, word: Any) -> None:
         """Say what the next part of the task needs; a copy goes on with it."""

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from obsnet import netcdf, provenance
+from obsnet.beside import usable_cores
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps, two_sided
 from obsnet.errors import LayoutError, WaveformError
@@ -134,7 +134,7 @@ def track(
     starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
     amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
     folder : write maps and features there block by block, so that memory stays flat with record length.
-    progress : called with seconds done and in all. threads : how many may work at a time, processes on the maps and threads on the search; all cores by default.
+    progress : called with seconds done and in all. threads : how many may work at a time, processes on the maps and threads on the search; all cores by default, and at most.
     heard : called with the run when all is heard, before tracks are looked for.
 
     Returns
@@ -169,7 +169,7 @@ def _run(
     heard: Callable[[Run], None] | None = None,
 ) -> Run:
     clock = Clock()
-    threads = threads or os.cpu_count() or 1
+    threads = usable_cores(threads)
 
     def listen(
         station: Station,

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from obsnet.beside import Beside, Crew
+from obsnet.beside import Beside, Crew, usable_cores
 from obsnet.errors import ConfigError, OutputError
 
 
@@ -269,6 +269,27 @@ def alive(process):
             return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize("asked", [0, -2, 1.5, True, "2"])
+def test_numbers_of_workers_that_cannot_be(asked):
+    with pytest.raises(ConfigError, match="whole number of at least 1"):
+        usable_cores(asked)
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="processes are bound to cores on Linux alone"
+)
+def test_no_more_work_at_a_time_than_there_are_cores():
+    """Those that this process is bound to, as by taskset or a batch system."""
+    before = os.sched_getaffinity(0)
+    assert usable_cores() == usable_cores(5000) == len(before)
+    assert usable_cores(1) == 1
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert usable_cores() == usable_cores(8) == 1
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def test_words_to_a_task_that_has_failed_are_no_error_of_their_own(tmp_path):
