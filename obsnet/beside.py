@@ -9,10 +9,34 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
+from queue import SimpleQueue
 from typing import Any
 
-from obsnet.errors import WorkerDied
+from obsnet.errors import ConfigError, WorkerDied
+
+_STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
+def usable_cores(asked: int | None = None) -> int:
+    """How many may work at a time: as many as are asked for, but no more than there are cores for this process, the default.
+
+    Raises
+    ------
+    ConfigError : fewer than one is asked for.
+    """
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        cores = os.cpu_count() or 1
+    if asked is None:
+        return cores
+    if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
+        raise ConfigError(
+            f"threads and processes must be a whole number of at least 1, or none for all cores, found {asked!r}"
+        )
+    return min(asked, cores)
 
 
 class Beside:
@@ -29,55 +53,38 @@ class Beside:
     """
 
     def __init__(self, task: Generator[None, Any, None], cores: int | None = None) -> None:
-        self._task, self._copy = task, None
+        self._task = task
         self._words: deque[Any] = deque()
-        if (cores or os.cpu_count() or 1) > 1 and _may_fork():
-            import multiprocessing
-
-            context = multiprocessing.get_context("fork")
-            self._line, there = context.Pipe()
-            self._copy = context.Process(target=_work, args=(task, self._line, there), daemon=True)
-            self._copy.start()
-            there.close()
+        self._copy = _Copy(_work, task) if (cores or usable_cores()) > 1 and _may_fork() else None
 
     def tell(self, word: Any) -> None:
         """Say what the next part of the task needs; a copy goes on with it."""
         if self._copy is None:
             self._words.append(word)
-            return
-        try:
-            self._line.send(word)
-        except OSError:
-            return  # the copy has ended: `finish` says why
+        else:
+            self._copy.tell(word)
 
     def finish(self) -> None:
         """Wait for the task; raises what it raised."""
         if self._copy is None:
             _go_on(self._task, self._words.popleft)
-            return
-        try:
-            error = self._line.recv()
-        except (EOFError, OSError):
-            self._copy.join()
-            raise WorkerDied(
-                f"a copy of this process ended with {self._copy.exitcode} (out of memory?)"
-            ) from None
-        if error is not None:
-            raise error
+        else:
+            self._copy.heard()
 
     def __enter__(self) -> Beside:
         return self
 
     def __exit__(self, *error: Any) -> None:
         if self._copy is not None:
-            self._copy.kill()  # a gentler signal is lost on a copy that is being made
-            self._copy.join()
-            self._line.close()
+            self._copy.kill()
+            self._copy.part()
 
 
 class Crew:
     """Does a task for many arguments beside this process: in forked copies of it, made at once, or in threads where it had
     better not be forked; with a size of one it does it itself, at once.
+
+    A thread each waits for one copy: whatever becomes of a copy, its line ends with it, and nobody else waits for it.
 
     Parameters
     ----------
@@ -88,14 +95,18 @@ class Crew:
     def __init__(self, task: Callable[..., Any], size: int) -> None:
         self._task = task
         self._executor: Executor | None = None
-        self._forked = size > 1 and _may_fork()
-        if self._forked:
-            import multiprocessing
-
-            context = multiprocessing.get_context("fork")
-            self._executor = ProcessPoolExecutor(size, context, _join_crew, (task,))
-            self._executor.submit(int)  # copies are made at the first task
-        elif size > 1:
+        self._copies: list[_Copy] = []
+        self._free: SimpleQueue[_Copy] = SimpleQueue()
+        if size > 1 and _may_fork():
+            self._task = self._asked
+            try:
+                for _ in range(size):
+                    self._copies.append(_Copy(_work_on, task))
+                    self._free.put(self._copies[-1])
+            except BaseException:
+                self.close()
+                raise
+        if size > 1:
             self._executor = ThreadPoolExecutor(size)
 
     def submit(self, *arguments: Any) -> Future:
@@ -104,28 +115,89 @@ class Crew:
             done: Future = Future()
             done.set_result(self._task(*arguments))
             return done
-        if self._forked:
-            return self._executor.submit(_crew_task, *arguments)
         return self._executor.submit(self._task, *arguments)
 
     @staticmethod
     def result_of(future: Future) -> Any:
-        """What a task gave.
+        """What a task gave; raises what it raised.
 
         Raises
         ------
         WorkerDied : its process did not live to say.
         """
-        try:
-            return future.result()
-        except BrokenExecutor:
-            raise WorkerDied("a copy of this process died at its work (out of memory?)") from None
+        return future.result()
 
     def close(self) -> None:
-        """Forget what has not begun, and part."""
+        """Forget what is not done, and part at once from copies, whatever they are at."""
+        for copy in self._copies:
+            copy.kill()
         if self._executor is not None:
             self._executor.shutdown(wait=True, cancel_futures=True)
             self._executor = None
+        for copy in self._copies:
+            copy.part()
+        self._copies = []
+
+    def _asked(self, *arguments: Any) -> Any:
+        copy = self._free.get()
+        try:
+            copy.tell(arguments)
+            return copy.heard()
+        finally:
+            self._free.put(copy)
+
+
+class _Copy:
+    """A forked copy of this process, which does some work at the other end of a line; it ends with this process.
+
+    Parameters
+    ----------
+    work : called there with the task and the line.
+    """
+
+    def __init__(self, work: Callable[[Any, Any], None], task: Any) -> None:
+        import multiprocessing
+
+        context = multiprocessing.get_context("fork")
+        self._line, there = context.Pipe()
+        self._process = context.Process(target=_in_copy, args=(work, task, self._line, there), daemon=True)
+        # This process's handlers are not the copy's: raised there they would undo what is being made here.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+        try:
+            self._process.start()
+            there.close()
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        except BaseException:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            self.kill()
+            self.part()
+            raise
+
+    def tell(self, word: Any) -> None:
+        with suppress(OSError):  # it has ended: `heard` says so
+            self._line.send(word)
+
+    def heard(self) -> Any:
+        """What the copy answers, or raises; `WorkerDied` where it did not live to say."""
+        try:
+            said, error = self._line.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            raise WorkerDied(
+                f"a copy of this process ended with {self._process.exitcode} (out of memory?)"
+            ) from None
+        if error is not None:
+            raise error
+        return said
+
+    def kill(self) -> None:
+        if self._process.pid is not None:
+            self._process.kill()
+
+    def part(self) -> None:
+        if self._process.pid is not None:
+            self._process.join()
+        self._line.close()
 
 
 def leave_signals_to_parent() -> None:
@@ -148,19 +220,32 @@ def _may_fork() -> bool:
     return sys.platform == "linux" and threading.active_count() == 1
 
 
-_task: Callable[..., Any] | None = None
-"""What this process, a copy of a crew, is there for."""
-
-
-def _join_crew(task: Callable[..., Any]) -> None:
-    global _task
-    _task = task
+def _in_copy(work: Callable[[Any, Any], None], task: Any, parents: Any, line: Any) -> None:
+    parents.close()
     leave_signals_to_parent()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
+    with suppress(EOFError, OSError):  # nobody is there any more
+        work(task, line)
 
 
-def _crew_task(*arguments: Any) -> Any:
-    assert _task is not None
-    return _task(*arguments)
+def _work(task: Generator[None, Any, None], line: Any) -> None:
+    _answer(line, _go_on, task, line.recv)
+
+
+def _work_on(task: Callable[..., Any], line: Any) -> None:
+    while True:
+        _answer(line, task, *line.recv())
+
+
+def _answer(line: Any, task: Callable[..., Any], *arguments: Any) -> None:
+    """Say what a task gives or raises."""
+    said, failed = None, None
+    try:
+        said = task(*arguments)
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        failed = error
+    line.send((said, failed))
 
 
 def _go_on(task: Generator[None, Any, None], heard: Callable[[], Any]) -> None:
@@ -170,18 +255,3 @@ def _go_on(task: Generator[None, Any, None], heard: Callable[[], Any]) -> None:
             task.send(heard())
         except StopIteration:
             return
-
-
-def _work(task: Generator[None, Any, None], parents: Any, line: Any) -> None:
-    parents.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    said: BaseException | None = None
-    try:
-        _go_on(task, line.recv)
-    except EOFError:
-        return
-    except Exception as error:
-        error.add_note(traceback.format_exc())
-        said = error
-    line.send(said)

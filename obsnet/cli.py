@@ -16,7 +16,8 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from obsnet import commands, console
-from obsnet.errors import ConfigError, ObsnetError
+from obsnet.beside import usable_cores
+from obsnet.errors import ConfigError
 
 app = typer.Typer(
     name="obsnet",
@@ -53,7 +54,10 @@ Overrides = Annotated[
 Start = Annotated[str | None, typer.Option("--start", help="ISO 8601 UTC start.")]
 End = Annotated[str | None, typer.Option("--end", help="ISO 8601 UTC end.")]
 Jobs = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Threads or processes (all cores by default).")
+    int | None,
+    typer.Option(
+        "--jobs", min=1, callback=usable_cores, help="Threads or processes; all cores by default and at most."
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
 AisFile = Annotated[Path | None, typer.Option("--ais", help="AIS file, overlaid on the report.")]
@@ -100,31 +104,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             console.hush()
             sys.exit(0)
         except Exception as error:
-            line = _line(error)
+            line = console.line_of(error)
             if line is None:
                 raise
             print(f"obsnet: error: {line}", file=sys.stderr)
             sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _line(error: Exception) -> str | None:
-    """What to tell the user in one line; nothing where the error is a defect of ours."""
-    text = str(error)
-    if isinstance(error, OSError) and not isinstance(error, ObsnetError):
-        if error.errno is None:
-            return None
-        text = (
-            f"{error.strerror}: {error.filename or 'while reading or writing'}; make room or check the path"
-        )
-    elif isinstance(error, MemoryError):
-        text = "this needs more memory than there is; give a shorter span or coarser grids"
-    elif hasattr(error, "format_message"):
-        command = getattr(error, "ctx", None)
-        text = f"{error.format_message().rstrip('.')}; see {command.command_path if command else 'obsnet'} --help"
-    elif not isinstance(error, ObsnetError):
-        return None
-    return " ".join(text.split())
 
 
 @app.command()
@@ -433,7 +418,7 @@ def reproduce(
     if name not in EXPERIMENTS:
         raise ConfigError(f"no experiment '{name}'; choose one of {', '.join(EXPERIMENTS)}")
     experiment = importlib.import_module(f"obsnet.experiments.{name}")
-    options: dict[str, Any] = {"seed": seed, "jobs": jobs or os.cpu_count() or 1}
+    options: dict[str, Any] = {"seed": seed, "jobs": jobs}
     if runs is not None:
         options["runs"] = runs
     if detector is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import numbers
 import re
 import types
 import typing
@@ -100,6 +101,12 @@ def merge_overrides(values: Mapping[str, Any], overrides: list[str]) -> dict[str
             f"overrides {overrides} cannot be applied: {' '.join(str(error).split())}"
         ) from None
     return {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
+
+
+def require_seed(seed: Any) -> None:
+    """`ConfigError` unless a generator of random numbers can be seeded with it."""
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or seed < 0:
+        raise ConfigError(f"the seed must be a whole number of at least 0, found {seed!r}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

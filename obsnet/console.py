@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
-from obsnet.errors import OutputError
+from obsnet.errors import ObsnetError, OutputError
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's `mallopt`, as malloc.h numbers them."""
@@ -132,6 +132,25 @@ def say(text: str) -> None:
     except OSError as error:
         hush()
         raise OutputError(f"cannot write to standard output: {error.strerror}") from None
+
+
+def line_of(error: Exception) -> str | None:
+    """What to tell the user in one line; nothing where the error is a defect of ours."""
+    text = str(error)
+    if isinstance(error, OSError) and not isinstance(error, ObsnetError):
+        if error.errno is None:
+            return None
+        text = (
+            f"{error.strerror}: {error.filename or 'while reading or writing'}; make room or check the path"
+        )
+    elif isinstance(error, MemoryError):
+        text = "this needs more memory than there is; give a shorter span or coarser grids"
+    elif hasattr(error, "format_message"):
+        command = getattr(error, "ctx", None)
+        text = f"{error.format_message().rstrip('.')}; see {command.command_path if command else 'obsnet'} --help"
+    elif not isinstance(error, ObsnetError):
+        return None
+    return " ".join(text.split())
 
 
 def counted(number: int, thing: str) -> str:

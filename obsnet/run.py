@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,14 +18,15 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from obsnet import netcdf, provenance
+from obsnet.beside import usable_cores
 from obsnet.config import build, to_dict
-from obsnet.detectors.maps import LikelihoodMaps, known_sides, two_sided
-from obsnet.errors import ConfigError, LayoutError, WaveformError
+from obsnet.detectors.maps import LikelihoodMaps, two_sided
+from obsnet.errors import LayoutError, WaveformError
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table, travel_time, write_propagation
 from obsnet.output import prepare_folder, write_text
-from obsnet.pipeline import NEEDS_FULL_AZIMUTHS, Minutes, Pipeline, RunConfig
+from obsnet.pipeline import Minutes, Pipeline, RunConfig
 from obsnet.provenance import Clock
 from obsnet.signals.spectra import iter_spectra
 from obsnet.signals.station import Station
@@ -42,11 +42,8 @@ from obsnet.tables import (
     track_of_row,
     tracks_csv,
 )
-from obsnet.trackers.grid_search import search
-from obsnet.trackers.remainder import Ghosts
-from obsnet.trackers.segmentation import segments
-from obsnet.trackers.steady import outdoes_steady_sources
-from obsnet.trackers.track import USUAL_MPS, Segment, Track
+from obsnet.trackers.track import Segment, Track
+from obsnet.tracking import ambiguity_deg, find_tracks
 
 if TYPE_CHECKING:
     import obspy
@@ -56,10 +53,6 @@ Progress = Callable[[float, float], None]
 
 PROPAGATION_FILE = "propagation.nc"
 """Of a run's folder, where its table is not that of the configured ocean."""
-NEIGHBOUR_S = 3600.0
-"""A track that ended no longer than this before a segment may explain what is heard in it."""
-BEARINGS_SHORTEST_S = 3600.0
-"""Bearings over less say too little of where a ship is, and that it is one."""
 
 
 @dataclass
@@ -153,7 +146,7 @@ def track(
     starttime, endtime : ISO text, UTCDateTime or datetime64; part of the record to use.
     amplitudes : `Amplitudes` from a calibration. table : propagation table instead of the configured ocean's.
     folder : write maps and features there block by block, so that memory stays flat with record length.
-    progress : called with seconds done and in all. threads : how many may work at a time, processes on the maps and threads on the search; all cores by default.
+    progress : called with seconds done and in all. threads : how many may work at a time, processes on the maps and threads on the search; all cores by default, and at most.
     heard : called with the run when all is heard, before tracks are looked for.
 
     Returns
@@ -188,7 +181,7 @@ def _run(
     heard: Callable[[Run], None] | None = None,
 ) -> Run:
     clock = Clock()
-    threads = threads or os.cpu_count() or 1
+    threads = usable_cores(threads)
 
     def listen(
         station: Station,
@@ -276,112 +269,6 @@ def _stream(
     yield from finished
 
 
-def find_tracks(run: Run, threads: int = 1) -> tuple[list[Segment], list[Track]]:
-    """Segments of a run's presence and the tracks within them, in time order."""
-    delay = travel_time(run.table)
-    found = (
-        _followed(run)
-        if run.config.tracker == "bernoulli"
-        else segments(run.presence, run.config.segmentation)
-    )
-    tracks: list[Track] = []
-    for segment in found:
-        near = [known for known in tracks if known.end > segment.start - NEIGHBOUR_S]
-        tracks += segment_tracks(run, segment, delay, near, threads)
-    return found, sorted(tracks, key=lambda found: found.motion.cpa_time)
-
-
-def segment_tracks(
-    run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray], near: list[Track], threads: int = 1
-) -> list[Track]:
-    """Tracks of one segment, given those found up to `NEIGHBOUR_S` before it; strongest first."""
-    ghosts = Ghosts(run.table, run.config.range.pairs) if "range_llr" in run.maps else None
-    new = search(run.maps, segment, delay, run.config.grid_search, threads, near, ghosts)
-    if not new and not near and not _range_heard(run, segment):
-        new = _by_bearings(run, segment, delay)
-    return [_said_ambiguous(found) if _two_sided(run, found) else found for found in new]
-
-
-def _said_ambiguous(track: Track) -> Track:
-    method = f"{track.method}; course ambiguous by 180°"
-    return replace(track, method=method, extra=track.extra | {"ambiguity_deg": 180.0})
-
-
-def _two_sided(run: Run, track: Track) -> bool:
-    """Whether none of a track's minutes with an azimuth tells it from the opposite one."""
-    if "azimuth_llr" not in run.maps:
-        return False
-    if _ambiguity_deg(run) == 180:
-        return True
-    times = to_posix(run.maps["time"].values)
-    said = (
-        run.maps["azimuth_llr"]
-        .isel(time=np.flatnonzero((times >= track.start) & (times <= track.end)))
-        .values
-    )
-    said = said[np.nan_to_num(said).max(axis=1) > 0]
-    return bool(len(said) and two_sided(said).all())
-
-
-def _ambiguity_deg(run: Run) -> int:
-    """180 where no azimuth of the run is told from its opposite, else 360."""
-    return int(run.maps["azimuth"].attrs.get("ambiguity_deg", 360)) if "azimuth" in run.maps else 360
-
-
-def _followed(run: Run) -> list[Segment]:
-    """Segments in which the Bernoulli filter, minute by minute, holds a ship for sure (existence over 0.9)."""
-    from obsnet.trackers.bernoulli import track_azimuth
-
-    if "azimuth_llr" not in run.maps or _ambiguity_deg(run) != 360:
-        raise ConfigError(NEEDS_FULL_AZIMUTHS)
-    times = to_posix(run.maps["time"].values)
-    held = track_azimuth(times, known_sides(run.maps["azimuth_llr"].values), run.maps["azimuth"].values)
-    run.live = pd.DataFrame(
-        {
-            "time": run.maps["time"].values,
-            "existence": held.existence,
-            "azimuth_deg": held.azimuth_deg,
-            "azimuth_std_deg": held.azimuth_std_deg,
-        }
-    )
-    sure = np.flatnonzero(np.diff(np.concatenate([[False], held.existence > 0.9, [False]]).astype(np.int8)))
-    stretches = [
-        Segment(float(times[lo]), float(times[hi - 1])) for lo, hi in zip(sure[::2], sure[1::2], strict=True)
-    ]
-    return [s for s in stretches if s.end - s.start >= 60.0 * run.config.segmentation.shortest_min]
-
-
-def _range_heard(run: Run, segment: Segment) -> bool:
-    """Whether the range detector heard anything in a tenth of a segment's minutes."""
-    if "range" not in run.presence:
-        return False
-    inside = run.presence.loc[segment.start : segment.end, "range"]
-    return bool((inside > 0).mean() > 0.1)
-
-
-def _by_bearings(run: Run, segment: Segment, delay: Callable[[np.ndarray], np.ndarray]) -> list[Track]:
-    """Track from the azimuths alone, for a segment in which no range was heard; speed is then a prior's."""
-    from obsnet.trackers.bearings_only import track_bearings
-
-    inside = (run.presence.index >= segment.start) & (run.presence.index <= segment.end)
-    azimuth = run.detections["azimuth_deg"].to_numpy(float)[inside]
-    if np.isfinite(azimuth).sum() < 30 or run.maps["azimuth"].attrs.get("ambiguity_deg", 360) != 360:
-        return []
-    config = run.config.azimuth
-    found = track_bearings(
-        run.presence.index.to_numpy(float)[inside],
-        azimuth,
-        5.0,
-        correlation_s=config.window_s,
-        speed_mps=USUAL_MPS[0],
-        speed_std_mps=USUAL_MPS[1],
-        delay=delay,
-    )
-    if found is None or found.end - found.start < BEARINGS_SHORTEST_S:
-        return []
-    return [found] if outdoes_steady_sources(run.maps, found, delay, run.config.grid_search) else []
-
-
 def write_tables(run: Run, folder: Path) -> None:
     """Write detections.csv, tracks.csv, tracks.geojson and run.json, and a propagation table that was given."""
     write_text(folder / "detections.csv", detections_csv(run.detections))
@@ -415,7 +302,7 @@ def _describe(run: Run, source: Any, clock: Clock) -> dict[str, Any]:
             for s in run.segments
         ],
         "tracks": len(run.tracks),
-        "azimuth_ambiguity_deg": _ambiguity_deg(run),
+        "azimuth_ambiguity_deg": ambiguity_deg(run),
         "ambiguous_tracks": [n for n, found in enumerate(run.tracks, 1) if found.ambiguity_deg == 180],
         "notes": _notes(run),
         "seconds": {stage: round(value, 3) for stage, value in clock.stages.items()},
@@ -429,7 +316,7 @@ def _notes(run: Run) -> list[str]:
         notes.append("no two horizontals: range only, courses are not observed")
     if len(run.presence) and "range" not in run.presence:
         notes.append("no hydrophone: azimuth from polarisation, ambiguous by 180°, no range")
-    elif _ambiguity_deg(run) == 180:
+    elif ambiguity_deg(run) == 180:
         notes.append("azimuth from polarisation, ambiguous by 180°")
     elif "azimuth_llr" in run.maps and (alone := two_sided(run.maps["azimuth_llr"].values).sum()):
         notes.append(

@@ -5,14 +5,15 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from obsnet import run as runs
+from obsnet import tracking
 from obsnet.kinematics import StraightCourse, wrap180
 from obsnet.layout import from_posix
 from obsnet.pipeline import RunConfig
-from obsnet.run import Run, segment_tracks
+from obsnet.run import Run
 from obsnet.trackers.search_config import GridSearchConfig
 from obsnet.trackers.steady import outdoes_steady_sources
 from obsnet.trackers.track import Segment, Track
+from obsnet.tracking import segment_tracks
 
 T0 = 1_369_123_200.0
 SHIP = StraightCourse(T0 + 3600.0, 6000.0, 40.0, 7.5)
@@ -35,7 +36,7 @@ def run_of(azimuth_deg, range_llr=-2.0):
 
 
 def tracks_of(run, monkeypatch):
-    monkeypatch.setattr(runs, "search", lambda *given: [])
+    monkeypatch.setattr(tracking, "search", lambda *given: [])
     times = run.presence.index
     return segment_tracks(run, Segment(times[0], times[-1]), no_delay, [])
 

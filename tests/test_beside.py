@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from obsnet.beside import Beside, Crew
+from obsnet.beside import Beside, Crew, usable_cores
 from obsnet.errors import ConfigError, OutputError
 
 
@@ -112,7 +112,7 @@ def task(what):
     seen.append(what)
     if what == "die":
         os._exit(9)
-    if what == "sleep":
+    if what.startswith("sleep"):
         print(os.getpid(), flush=True)
         time.sleep(60)
     return os.getpid(), len(seen)
@@ -169,12 +169,127 @@ def test_copies_end_with_a_process_that_is_killed():
     made.stdout.close()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+@pytest.mark.parametrize("dead", ["before", "meanwhile"])
+def test_work_for_copies_that_were_killed_is_an_error(dead):
+    """More work than a line holds, so that it is being sent when they are killed."""
+    made = alone(f"""
+import multiprocessing, signal
+crew = Crew(task, 2)
+def kill():
+    for copy in multiprocessing.active_children():
+        copy.kill()
+        copy.join()
+if {dead!r} == "before":
+    kill()
+futures = [crew.submit("sleep" + 10_000_000 * "!") for _ in range(9)]
+if {dead!r} == "meanwhile":
+    time.sleep(0.2)
+    kill()
+for future in futures:
+    try:
+        crew.result_of(future)
+    except WorkerDied as error:
+        assert "out of memory" in str(error)
+    else:
+        raise SystemExit("it was not said")
+crew.close()
+""")
+    assert made.returncode == 0, made.stderr
+    assert made.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+@pytest.mark.parametrize("at", ["work", "a stop"])
+def test_a_crew_is_left_at_once(at):
+    """Whatever its copies are at, as in half of an answer."""
+    begin = time.monotonic()
+    made = alone(f"""
+import multiprocessing, signal
+crew = Crew(task, 2)
+futures = [crew.submit("sleep") for _ in range(5)]
+time.sleep(0.2)
+if {at!r} == "a stop":
+    for copy in multiprocessing.active_children():
+        os.kill(copy.pid, signal.SIGSTOP)
+crew.close()
+assert not multiprocessing.active_children()
+""")
+    assert made.returncode == 0, made.stderr
+    assert time.monotonic() - begin < 20
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+def test_a_request_to_the_whole_group_ends_it():
+    """As by systemctl stop, Slurm or timeout: the copies die of it while the process unwinds."""
+    made = subprocess.run(
+        [sys.executable, "-c", ALONE + """
+import signal
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+crew = Crew(task, 2)
+futures = [crew.submit("sleep" + 10_000_000 * "!") for _ in range(9)]
+try:
+    os.killpg(0, signal.SIGTERM)
+    crew.result_of(futures[0])
+finally:
+    crew.close()
+"""],
+        capture_output=True, text=True, check=False, timeout=60, start_new_session=True,
+    )  # fmt: skip
+    assert (made.returncode, made.stderr) == (143, "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+@pytest.mark.parametrize("beside", ["Crew(task, 2)", "Beside(noted(), 2)"])
+def test_a_copy_that_is_being_made_does_not_unwind_its_parent(beside):
+    """What a handler raises within the copy would otherwise go through all that the parent is in."""
+    made = alone(f"""
+import multiprocessing, signal
+from obsnet.beside import Beside
+def noted():
+    yield
+    yield
+def stop(*_):
+    print("handled", flush=True)
+    sys.exit(143)
+signal.signal(signal.SIGTERM, stop)
+os.register_at_fork(after_in_child=lambda: os.kill(os.getpid(), signal.SIGTERM))
+made = {beside}
+for copy in multiprocessing.active_children():
+    copy.join()
+    assert copy.exitcode == -signal.SIGTERM, copy.exitcode
+""")
+    assert made.returncode == 0, made.stderr
+    assert made.stdout == ""
+
+
 def alive(process):
     try:
         with open(f"/proc/{process}/stat", encoding="ascii") as file:
             return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize("asked", [0, -2, 1.5, True, "2"])
+def test_numbers_of_workers_that_cannot_be(asked):
+    with pytest.raises(ConfigError, match="whole number of at least 1"):
+        usable_cores(asked)
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="processes are bound to cores on Linux alone"
+)
+def test_no_more_work_at_a_time_than_there_are_cores():
+    """Those that this process is bound to, as by taskset or a batch system."""
+    before = os.sched_getaffinity(0)
+    assert usable_cores() == usable_cores(5000) == len(before)
+    assert usable_cores(1) == 1
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert usable_cores() == usable_cores(8) == 1
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def test_words_to_a_task_that_has_failed_are_no_error_of_their_own(tmp_path):

@@ -63,11 +63,20 @@ def test_a_run_and_a_station_bring_no_compiler():
     )
 
 
+FIVE_CORES = """
+import os, sys
+os.sched_getaffinity = lambda process: set(range(5))
+from obsnet.cli import main
+main(sys.argv[1:])
+"""
+
+
 @pytest.mark.parametrize("detector", ["learned", "analytic"])
 def test_how_many_processes_make_the_maps_changes_nothing(record, tmp_path, detector):
     for jobs in (1, 2, 5):
+        given = tracking(record, tmp_path / str(jobs), "--quiet", "--jobs", jobs, "--detector", detector)
         done = subprocess.run(
-            tracking(record, tmp_path / str(jobs), "--quiet", "--jobs", jobs, "--detector", detector),
+            [*given[:1], "-c", FIVE_CORES, *given[3:]],
             env=environment(), capture_output=True, text=True, timeout=120,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr

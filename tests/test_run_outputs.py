@@ -243,7 +243,7 @@ def test_any_split_of_the_record_gives_the_same_rows(tracked, finished, stream, 
 
 def test_a_run_read_again_is_the_run(finished):
     """Segments of the folder's files are those of the run: what tells closing from opening is kept."""
-    from obsnet.run import find_tracks
+    from obsnet.tracking import find_tracks
 
     run = read_run(finished)
     found, tracks = find_tracks(run)

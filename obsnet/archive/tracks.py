@@ -26,10 +26,11 @@ from obsnet.errors import ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.rays import travel_time
 from obsnet.pipeline import RunConfig
-from obsnet.run import NEIGHBOUR_S, Run, segment_tracks
+from obsnet.run import Run
 from obsnet.tables import TRACK_COLUMNS
 from obsnet.trackers.segmentation import segments
 from obsnet.trackers.track import Segment, Track
+from obsnet.tracking import NEIGHBOUR_S, segment_tracks
 
 _PRESENCE = {
     "azimuth_llr": "azimuth",

@@ -32,9 +32,10 @@ from obsnet.experiments.ablation_records import KINDS
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.output import write_text
 from obsnet.pipeline import RunConfig
-from obsnet.run import Run, find_tracks, track
+from obsnet.run import Run, track
 from obsnet.signals.cepstrogram import CepstrogramConfig
 from obsnet.signals.station import Station
+from obsnet.tracking import find_tracks
 
 Maker = Callable[[str, int, float, Path], None]
 """Writes the record of (kind, seed, hours) into a folder: waveforms.mseed, station.xml, ais.csv, truth.csv."""

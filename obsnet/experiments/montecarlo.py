@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from obsnet.config import require_seed
 from obsnet.errors import ConfigError
 
 Outcome = TypeVar("Outcome")
@@ -25,8 +26,7 @@ def seeds(runs: int, seed: int) -> list[np.random.SeedSequence]:
     """
     if isinstance(runs, bool) or not isinstance(runs, (int, np.integer)) or runs < 1:
         raise ConfigError(f"a Monte Carlo study needs a whole number of runs, at least 1, found {runs!r}")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ConfigError(f"the seed must be a whole number of at least 0, found {seed!r}")
+    require_seed(seed)
     return np.random.SeedSequence(int(seed)).spawn(int(runs))
 
 

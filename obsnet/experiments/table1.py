@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsnet.ais import ReferenceTrack, read, reference_tracks
-from obsnet.config import build
+from obsnet.config import build, require_seed
 from obsnet.errors import ConfigError, ModelError, ObsnetError
 from obsnet.evaluation import Evaluation, evaluate
 from obsnet.layout import to_posix
@@ -110,6 +110,10 @@ def reproduce(
     runs : the week is one record; more than one is refused. seed : of the ships' sounds and the sea.
     progress : called with (done, total). jobs : threads.
     detector : name of a detector; 'all' for each of `DETECTORS` in turn, those without a model left out.
+
+    Raises
+    ------
+    ConfigError : `runs`, `seed` or `detector` cannot be.
     """
     if runs != 1:
         raise ConfigError(
@@ -117,6 +121,7 @@ def reproduce(
         )
     if detector not in (None, "all", *DETECTORS):
         raise ConfigError(f"detector must be one of {', '.join(DETECTORS)}, all; found {detector!r}")
+    require_seed(seed)
     reference = ships()
     names: list[str | None] = [*DETECTORS] if detector == "all" else [detector]
     stages = len(names) + 1

@@ -23,12 +23,13 @@ from obsnet.live.config import WatchConfig
 from obsnet.live.store import LIVE_COLUMNS, Store
 from obsnet.ocean.rays import travel_time
 from obsnet.pipeline import Minutes
-from obsnet.run import NEIGHBOUR_S, Run, segment_tracks
+from obsnet.run import Run
 from obsnet.signals.station import Station
 from obsnet.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from obsnet.trackers.bernoulli_range import StationTracker
 from obsnet.trackers.segmentation import quiet_until, segments
 from obsnet.trackers.track import Segment, Track
+from obsnet.tracking import NEIGHBOUR_S, segment_tracks
 
 
 class LiveEstimate:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from obsnet.config import require_seed
 from obsnet.errors import ConfigError
+
+MOST_CELLS = 5e4
+"""Of CPA range and speed in the coarsest grid, 20 times as many as by default: a day's tiles of these take a gigabyte."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class GridSearchConfig:
             )
         if not 0.0 <= self.range_scale_std < 1.0:
             raise ConfigError(f"range_scale_std must lie in [0, 1), found {self.range_scale_std}")
+        require_seed(self.seed)
         for name in (
             "tile_s",
             "tile_bound",
@@ -62,6 +67,13 @@ class GridSearchConfig:
         ):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
+        # The coarsest steps: 1 km on either side, 0.5 m/s.
+        cells = 2e-3 * self.max_cpa_range_m * 2.0 * (self.max_speed_mps - self.min_speed_mps)
+        if not cells <= MOST_CELLS:
+            raise ConfigError(
+                f"max_cpa_range_m of {self.max_cpa_range_m:g} and max_speed_mps of {self.max_speed_mps:g} make a grid of "
+                f"{cells:.0e} cells; lower them"
+            )
 
 
 @dataclass(frozen=True)
