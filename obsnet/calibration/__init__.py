@@ -146,10 +146,14 @@ def calibrate(
     expected = Amplitudes.default().scaled_to(station.depth_m)
     branches = Branches(passages, table, tuple(pair for pair in config.pairs if pair in expected.pairs))
     echo = echo_delay(branches, expected, config.echo_delay_s, config.search_m, config.search_step_m)
+    place, turned = None, None
     if echo:
-        branches = branches.late(echo.delay_s)
-        echo = replace(echo, delay_s=table.attrs.get("echo_delay_s", 0.0) + echo.delay_s)
-    place, turned = _place_and_turn(station, passages, branches, expected, config, notes)
+        late = branches.late(echo.delay_s)
+        place, turned = _place_and_turn(station, passages, late, expected, config, [])
+        echo = replace(echo, delay_s=table.attrs.get("echo_delay_s", 0.0) + echo.delay_s) if place else None
+        branches = late if place else branches
+    if not place:
+        place, turned = _place_and_turn(station, passages, branches, expected, config, notes)
     shift = (place.east_m, place.north_m) if place else (0.0, 0.0)
     polarity = _polarity(station, downward_flux(passages), notes)
     edges = np.arange(0.0, config.amplitude_range_m + config.bin_m / 2, config.bin_m)

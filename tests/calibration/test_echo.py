@@ -48,6 +48,11 @@ def test_noise_and_too_few_frames_say_nothing(table):
     assert found(given, table)[1] is None
 
 
+def test_one_passage_alone_does_not_tell_a_late_echo_from_another_place(table):
+    given = simulated(delay_echoes(table, 0.1), (0.0, 0.0), courses=((7000.0, 0.0),))
+    assert found(given, table)[1] is None
+
+
 def test_a_delay_at_the_edge_of_the_search_is_not_taken(table):
     branches = Branches(simulated(delay_echoes(table, 0.2), (0.0, 0.0)), table, PAIRS)
     assert echo_delay(branches, Amplitudes.table_ii(), (-0.1, 0.15), 600.0, 100.0) is None
