@@ -60,7 +60,7 @@ def track(
     )  # fmt: skip
     reference = read_reference(ais, station, quiet=quiet) if ais else None
     task = runs.track if tracking else runs.detect
-    with staged(out, leftovers=("live.csv",)) as folder, ExitStack() as stack:
+    with staged(out, leftovers=("live.csv", "figure-[35678].png")) as folder, ExitStack() as stack:
         report = stack.enter_context(Beside(_drawing(folder / "report.png", reference), jobs))
         with console.progress("reading and detecting", quiet) as progress:
             run = task(
