@@ -269,7 +269,7 @@ def _summary(run: Run, out: Path) -> None:
     found = run.detections
     azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
     console.say(
-        f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range"
+        f"{run.station.code}: {console.counted(len(found), 'minute')}, {azimuths} with an azimuth, {ranges} with a range"
     )
     for note in run.info.get("notes", []):
         console.say(f"note: {note}")
