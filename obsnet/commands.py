@@ -62,7 +62,8 @@ def track(
         station = placed(station, waveforms, settings, start, end)
     reference = read_reference(ais, station, quiet=quiet) if ais else None
     task = runs.track if tracking else runs.detect
-    with staged(out, leftovers=("live.csv", runs.PROPAGATION_FILE)) as folder, ExitStack() as stack:
+    leftovers = ("live.csv", runs.PROPAGATION_FILE, "figure-[35678].png")
+    with staged(out, leftovers=leftovers) as folder, ExitStack() as stack:
         report = stack.enter_context(Beside(_drawing(folder / "report.png", reference), jobs))
         with console.progress("reading and detecting", quiet) as progress:
             run = task(
@@ -281,7 +282,7 @@ def _summary(run: Run, out: Path) -> None:
     found = run.detections
     azimuths, ranges = int(found["azimuth_deg"].notna().sum()), int(found["range_m"].notna().sum())
     console.say(
-        f"{run.station.code}: {len(found)} minutes, {azimuths} with an azimuth, {ranges} with a range"
+        f"{run.station.code}: {console.counted(len(found), 'minute')}, {azimuths} with an azimuth, {ranges} with a range"
     )
     for note in run.info.get("notes", []):
         console.say(f"note: {note}")

@@ -40,8 +40,8 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
     Parameters
     ----------
     folder : where the files shall be.
-    leftovers : names of files that an earlier run may have left in `folder` and that must not stay beside the
-        new ones.
+    leftovers : names, or patterns of names, of files that an earlier run may have left in `folder` and that must not
+        stay beside the new ones.
 
     Raises
     ------
@@ -98,8 +98,10 @@ def _move(stage: Path, folder: Path, leftovers: tuple[str, ...]) -> None:
     try:
         for name in written:
             os.replace(stage / name, folder / name)
-        for name in set(leftovers) - set(written):
-            (folder / name).unlink(missing_ok=True)
+        for path in [path for pattern in leftovers for path in folder.glob(pattern)]:
+            name = path.name
+            if name not in written:
+                path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write {folder / name}: {error.strerror}") from None
 

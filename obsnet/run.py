@@ -21,7 +21,7 @@ from obsnet import netcdf, provenance
 from obsnet.beside import usable_cores
 from obsnet.config import build, to_dict
 from obsnet.detectors.maps import LikelihoodMaps, two_sided
-from obsnet.errors import LayoutError, WaveformError
+from obsnet.errors import ConfigError, LayoutError, StationError, WaveformError
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.amplitudes import Amplitudes
 from obsnet.ocean.rays import propagation_table, travel_time, write_propagation
@@ -157,10 +157,7 @@ def track(
     ------
     ObsnetError : the waveforms, the station or the configuration cannot serve.
     """
-    config = config or RunConfig()
-    if detector is not None:
-        config = replace(config, detector=detector)
-    return _run(stream, station, config, tracking=True, **options)
+    return _run(stream, station, config or RunConfig(), tracking=True, detector=detector, **options)
 
 
 # The matrices are small: a pool of BLAS threads takes longer to wake than to multiply.
@@ -171,6 +168,7 @@ def _run(
     config: RunConfig,
     *,
     tracking: bool,
+    detector: Any = None,
     starttime: Any = None,
     endtime: Any = None,
     amplitudes: Amplitudes | None = None,
@@ -180,6 +178,9 @@ def _run(
     threads: int | None = None,
     heard: Callable[[Run], None] | None = None,
 ) -> Run:
+    _require_kinds(waveforms, station, config)
+    if detector is not None:
+        config = replace(config, detector=detector)
     clock = Clock()
     threads = usable_cores(threads)
 
@@ -227,6 +228,20 @@ def _run(
     if amplitudes is not None:
         run.info["amplitudes"] = amplitudes.to_dict()
     return run
+
+
+def _require_kinds(waveforms: Any, station: Any, config: Any) -> None:
+    """An `ObsnetError` where what is given is of another kind than is taken; of paths their reader says it."""
+    if not isinstance(station, Station):
+        raise StationError(
+            f"obsnet takes a Station, as of Station.from_stationxml, found a {type(station).__name__}"
+        )
+    if not isinstance(config, RunConfig):
+        raise ConfigError(
+            f"obsnet takes a RunConfig, found a {type(config).__name__}; give RunConfig(…), or none for the defaults"
+        )
+    if getattr(waveforms, "traces", None) == []:
+        raise WaveformError(f"the Stream is empty; give one that holds waveforms of {station.code}")
 
 
 class _MuteHydrophone(Exception):

@@ -44,7 +44,9 @@ def tracks_csv(rows: pd.DataFrame) -> str:
 
 
 def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
-    """Tracks as timed LineStrings in WGS 84 (a FeatureCollection, RFC 7946)."""
+    """Tracks as timed lines in WGS 84 (a FeatureCollection, RFC 7946): LineStrings, and MultiLineStrings where they cross the
+    antimeridian, which cuts them; `times` are nested as the positions are.
+    """
     from pyproj import Proj
 
     local = Proj(proj="aeqd", lat_0=station.latitude, lon_0=station.longitude, datum="WGS84")
@@ -54,15 +56,20 @@ def geojson(tracks: list[Track], station: Station) -> dict[str, Any]:
             continue
         times, east, north = found.positions(300.0)
         longitude, latitude = local(east, north, inverse=True)
-        # Across the antimeridian a line goes on beyond 180° rather than around the world.
-        longitude = station.longitude + wrap180(np.asarray(longitude) - station.longitude)
         properties = {key: None if value != value else value for key, value in found.row(number).items()}
-        properties["times"] = [iso(t, milliseconds=True) for t in times]
-        properties["method"] = found.method
-        coordinates = [
-            [round(float(x), 6), round(float(y), 6)] for x, y in zip(longitude, latitude, strict=True)
+        parts = _cut(np.column_stack([longitude, latitude, (times - times[0]).astype(float)]))
+        stamps = [
+            [iso(times[0] + np.timedelta64(round(ns), "ns"), milliseconds=True) for ns in part[:, 2]]
+            for part in parts
         ]
-        line = {"type": "LineString", "coordinates": coordinates}
+        lines = [[[round(x, 6), round(y, 6)] for x, y in part[:, :2].tolist()] for part in parts]
+        whole = len(parts) == 1
+        properties["times"] = stamps[0] if whole else stamps
+        properties["method"] = found.method
+        line = {
+            "type": "LineString" if whole else "MultiLineString",
+            "coordinates": lines[0] if whole else lines,
+        }
         features.append({"type": "Feature", "geometry": line, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
 
@@ -81,3 +88,18 @@ def track_of_row(row: pd.Series) -> Track:
 def seconds(text: str) -> float:
     """Seconds since 1970 of a time in these files."""
     return float(to_posix(np.datetime64(text.removesuffix("Z"))))
+
+
+def _cut(line: np.ndarray) -> list[np.ndarray]:
+    """Parts of a line of (longitude [deg], latitude [deg], time [ns]) between antimeridians, longitudes within ±180°."""
+    line = np.column_stack([np.unwrap(line[:, 0], period=360.0), line[:, 1:]])
+    turns = np.floor((line[:, 0] + 180.0) / 360.0)
+    parts, points = [], [line[0]]
+    for one, other, before, after in zip(line[:-1], line[1:], turns[:-1], turns[1:], strict=True):
+        if before != after:
+            edge = 360.0 * max(before, after) - 180.0
+            crossing = one + (edge - one[0]) / (other[0] - one[0]) * (other - one)
+            parts.append(np.array([*points, crossing]) - [360.0 * before, 0.0, 0.0])
+            points = [crossing]
+        points.append(other)
+    return [*parts, np.array(points) - [360.0 * turns[-1], 0.0, 0.0]]

@@ -13,8 +13,8 @@ import xarray as xr
 from pyproj import Geod
 from threadpoolctl import threadpool_info
 
-from obsnet import Station, commands, detect, netcdf
-from obsnet.errors import AISError
+from obsnet import Station, commands, detect, netcdf, track
+from obsnet.errors import AISError, ObsnetError
 from obsnet.evaluation import evaluate, evaluate_folder
 from obsnet.kinematics import StraightCourse
 from obsnet.pipeline import RunConfig
@@ -113,14 +113,48 @@ def test_geojson_is_lines_in_wgs84_with_times(finished, inventory):
     assert length / seconds == pytest.approx(8, abs=0.5)
 
 
-@pytest.mark.parametrize("longitude", [179.9, -179.9, 0.0])
-def test_a_line_across_the_antimeridian_does_not_go_around_the_world(longitude):
-    course = StraightCourse(START.timestamp, 5000.0, 90.0, 8.0)
+def line_past(longitude, course_deg=90.0):
+    """Geometry and times of a ship that passes a station at a longitude, within an hour or two of it."""
+    course = StraightCourse(START.timestamp, 5000.0, course_deg, 8.0)
     track = Track(START.timestamp - 7200, START.timestamp + 7200, course, np.eye(4), 100.0)
     (feature,) = geojson([track], Station("XX.SIM01", -20.0, longitude, 4000.0))["features"]
-    found = np.array(feature["geometry"]["coordinates"])[:, 0]
+    return feature["geometry"], feature["properties"]["times"]
+
+
+@pytest.mark.parametrize("longitude", [234.5, -125.5, 0.0, 360.0])
+def test_longitudes_are_those_of_geojson(longitude):
+    line, times = line_past(longitude)
+    assert line["type"] == "LineString"
+    found = np.array(line["coordinates"])[:, 0]
+    assert len(times) == len(found)
     assert (np.abs(np.diff(found)) < 0.1).all()
-    assert np.abs(found - longitude).max() < 1.0
+    assert np.abs(found - (longitude + 180) % 360 + 180).max() < 1.0
+    assert line == line_past((longitude + 180) % 360 - 180)[0]
+
+
+@pytest.mark.parametrize("course_deg", [90.0, 270.0])
+@pytest.mark.parametrize("longitude", [179.9, -179.9, 180.1])
+def test_a_line_across_the_antimeridian_is_cut_there(longitude, course_deg):
+    """RFC 7946, 3.1.9: no line goes around the world, none leaves it; each position keeps its time."""
+    line, times = line_past(longitude, course_deg)
+    assert line["type"] == "MultiLineString"
+    before, after = (np.array(part) for part in line["coordinates"])
+    east = 1 if course_deg == 90.0 else -1
+    assert (before[-1, 0], after[0, 0]) == (180.0 * east, -180.0 * east)
+    assert before[-1, 1] == after[0, 1]
+    for part in (before, after):
+        assert (np.abs(part[:, 0]) <= 180).all()
+        assert (np.diff(part[:, 0]) * east > 0).all()
+        assert (np.abs(np.diff(part[:, 0])) < 0.1).all()
+        assert np.abs((part[:, 0] - longitude + 180) % 360 - 180).max() < 1.0
+    assert [len(part) for part in times] == [len(before), len(after)]
+    assert times[0][-1] == times[1][0]
+    whole = pd.to_datetime([*times[0], *times[1][1:]])
+    assert whole.is_monotonic_increasing
+    speed = np.diff(np.unwrap([*before[:, 0], *after[1:, 0]], period=360)) / np.diff(
+        whole.tz_localize(None).to_numpy()
+    ).astype(float)
+    np.testing.assert_allclose(speed, np.median(speed), rtol=0.01)
 
 
 def test_times_of_cpa_are_all_alike():
@@ -449,11 +483,14 @@ def test_times_with_an_offset_are_that_time(tracked, record):
 def test_a_run_after_another_leaves_nothing_of_it(tracked, obsnet, record):
     out = tracked(record / "waveforms.mseed", "--tracker", "bernoulli")
     assert (out / "live.csv").exists()
+    assert obsnet("plot", out, "--figure", "3", "--quiet")[0] == 0
+    assert (out / "figure-3.png").exists()
+    (out / "figure-1.png").write_text("of something else")
     status, _, _ = obsnet(
         "detect", record / "waveforms.mseed", "--station", record / "station.xml", "--out", out, "--quiet"
     )
     assert status == 0
-    assert {path.name for path in out.iterdir()} == FILES
+    assert {path.name for path in out.iterdir()} == {*FILES, "figure-1.png"}
 
 
 def test_evaluate_reads_what_was_written(obsnet, record, finished):
@@ -474,3 +511,34 @@ def test_a_run_in_python_keeps_blas_to_one_thread(stream, inventory):
     station = Station.from_stationxml(inventory)
     detect(stream, station, endtime=START + 1800, heard=lambda run: seen.append(threads()))
     assert (seen, threads()) == ([{1}], before)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        ({"station": "station.xml"}, "a Station, as of Station.from_stationxml, found a str"),
+        ({"station": None}, "found a NoneType"),
+        ({"config": {"detector": "analytic"}}, "a RunConfig, found a dict"),
+        ({"config": {"detector": "analytic"}, "detector": "learned"}, "a RunConfig, found a dict"),
+        ({"stream": obspy.Stream()}, "the Stream is empty"),
+        ({"threads": -2}, "must be a whole number of at least 1, or none for all cores, found -2"),
+    ],
+)
+def test_what_is_given_wrong_in_python_is_said(stream, inventory, wrong, found):
+    given = {"stream": stream, "station": Station.from_stationxml(inventory), "endtime": START + 600} | wrong
+    with pytest.raises(ObsnetError, match=re.escape(found)):
+        track(**given)
+
+
+def test_one_minute_is_no_minutes(obsnet, record, tmp_path, unplotted):
+    given = (
+        "detect",
+        record / "waveforms.mseed",
+        "--station",
+        record / "station.xml",
+        "--out",
+        tmp_path / "out",
+    )
+    status, told, _ = obsnet(*given, "--end", str(START + 100))
+    assert status == 0
+    assert any("XX.SIM01: 1 minute, " in line for line in told), told
