@@ -294,8 +294,8 @@ def write_tables(run: Run, folder: Path) -> None:
         stamps = np.datetime_as_string(run.live["time"].to_numpy("datetime64[s]"))
         live = run.live.assign(time=np.char.add(stamps, "Z"))
         write_text(folder / "live.csv", live.to_csv(index=False, float_format="%.6g"))
-    if kept := run.info.get("propagation_table"):
-        write_propagation(run.table, folder / kept)
+    if "propagation_table" in run.info:
+        write_propagation(run.table, folder / PROPAGATION_FILE)
     write_text(folder / "run.json", json.dumps(run.info, indent=1, default=str))
 
 
@@ -364,7 +364,7 @@ def read_run(folder: str | Path) -> Run:
             for s in info["segments"]
         ]
         tracks = [track_of_row(row) for _, row in rows.iterrows()]
-        kept = folder / info["propagation_table"] if "propagation_table" in info else None
+        kept = folder / PROPAGATION_FILE if "propagation_table" in info else None
     except FileNotFoundError as error:
         missing = Path(error.filename).name if folder.is_dir() else "the folder"
         raise LayoutError(f"{folder} is not a folder of `obsnet track`: {missing} is missing") from None

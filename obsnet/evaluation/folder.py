@@ -51,7 +51,7 @@ def evaluate_folder(
     try:
         station = {key: float(info["station"][key]) for key in ("latitude", "longitude", "depth_m")}
         place = station["latitude"], station["longitude"]
-        kept = Path(folder, info["propagation_table"]) if "propagation_table" in info else None
+        kept = Path(folder, Path(info["propagation_table"]).name) if "propagation_table" in info else None
         delay = _delay_of_run(info["config"], station["depth_m"], kept)
         ambiguous = info.get("azimuth_ambiguity_deg", 360) == 180
         half_known = tracks["track"].isin(info.get("ambiguous_tracks", []))
