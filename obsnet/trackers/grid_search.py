@@ -32,7 +32,7 @@ from obsnet.trackers.line_doppler import Lines
 from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.remainder import Ghosts, Remainder
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
-from obsnet.trackers.search_config import FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
+from obsnet.trackers.search_config import COARSE, FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
 from obsnet.trackers.steady import fixed_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 from obsnet.trackers.verdict import (
@@ -236,12 +236,13 @@ class _Finder:
         step = config.tile_s
         edge = self.tiles[-1]
         cpa_time = np.arange(-1800.0, edge + 1800.0 + step, step)
-        half = 1000.0 * int(config.max_cpa_range_m / 1000.0)
-        cpa_range = np.arange(-half, half + 1.0, 1000.0)
+        range_step, course_step, speed_step = COARSE
+        half = range_step * int(config.max_cpa_range_m / range_step)
+        cpa_range = np.arange(-half, half + 1.0, range_step)
         if not self.sees_course:
             cpa_range = cpa_range[cpa_range >= 0]
-        speed = np.arange(config.min_speed_mps, config.max_speed_mps + 1e-9, 0.5)
-        course = np.arange(0.0, 360.0, 10.0) if self.sees_course else np.zeros(1)
+        speed = np.arange(config.min_speed_mps, config.max_speed_mps + 1e-9, speed_step)
+        course = np.arange(0.0, 360.0, course_step) if self.sees_course else np.zeros(1)
         if self._everywhere is None:
             self._everywhere = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
         grid = self._everywhere.reading(scores)

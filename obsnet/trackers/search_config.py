@@ -11,6 +11,10 @@ MOST_CELLS = 5e4
 """Of CPA range and speed in the coarsest grid, 20 times as many as by default: a day's tiles of these take a gigabyte."""
 
 
+COARSE = (1000.0, 10.0, 0.5)
+"""Steps of the grid over the whole prior: CPA range [m], course [deg], speed [m/s]."""
+
+
 @dataclass(frozen=True)
 class GridSearchConfig:
     """Prior, likelihood and levels of the grid search.
@@ -67,8 +71,10 @@ class GridSearchConfig:
         ):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} must be positive, found {getattr(self, name)}")
-        # The coarsest steps: 1 km on either side, 0.5 m/s.
-        cells = 2e-3 * self.max_cpa_range_m * 2.0 * (self.max_speed_mps - self.min_speed_mps)
+        range_step, _, speed_step = COARSE
+        cells = (
+            2.0 * self.max_cpa_range_m / range_step * (self.max_speed_mps - self.min_speed_mps) / speed_step
+        )
         if not cells <= MOST_CELLS:
             raise ConfigError(
                 f"max_cpa_range_m of {self.max_cpa_range_m:g} and max_speed_mps of {self.max_speed_mps:g} make a grid of "
