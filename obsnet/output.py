@@ -108,10 +108,17 @@ def _move(stage: Path, folder: Path, leftovers: tuple[str, ...]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a small file aside and move it into place."""
+    with aside(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def aside(path: Path) -> Iterator[Path]:
+    """Where to write a file that is moved into place once it is whole; `OutputError` where it cannot be written."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        partial.write_text(text, encoding="utf-8")
+        yield partial
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise OutputError(f"cannot write {path}: {error.strerror}; make room for it") from None
+        raise OutputError(f"cannot write {path}: {error.strerror or error}; make room for it") from None

@@ -39,9 +39,9 @@ def echo_delay(
 
     Returns
     -------
-    Echo, or None where there is one passage alone, which another place of the station explains nearly as well, or where
-    the passages are explained as well without: by less than 4 standard deviations of
-    noise, or within 3 of the delay's own.
+    Echo, or None where there is one passage alone, which another place of the station explains nearly as well, or
+    where the passages are explained as well without: by less than 4 standard deviations of noise, or within 3 of
+    the delay's own.
     """
     if branches.heard.time.size < MIN_FRAMES or np.unique(branches.heard.passage).size < 2:
         return None

@@ -6,7 +6,6 @@ Path k crosses the water column k = 1, 3, 5, … times: before it arrives it has
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from obsnet.errors import ConfigError, LayoutError, OutputError
+from obsnet.errors import ConfigError, LayoutError
 from obsnet.layout import PROPAGATION, require
 from obsnet.ocean.bottom import Bottom
 from obsnet.ocean.sound_speed import OceanConfig, SoundSpeed
+from obsnet.output import aside
 
 PATHS = (1, 3, 5, 7, 9, 11)
 STEEP_RAYS, GRAZING_RAYS = 1200, 300
@@ -239,14 +239,8 @@ def write_propagation(table: xr.Dataset, path: str | Path) -> None:
     for name in ("pressure", "reflection"):
         if name in table:
             plain[f"{name}_real"], plain[f"{name}_imag"] = table[name].real, table[name].imag
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with aside(Path(path)) as partial:
         plain.to_netcdf(partial, engine="h5netcdf")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OutputError(f"cannot write {path}: {error.strerror or error}; make room for it") from None
 
 
 def interpolate(table: xr.Dataset, range_m: np.ndarray) -> xr.Dataset:
