@@ -279,7 +279,8 @@ class _Finder:
         speed = speed[(speed >= self.config.min_speed_mps) & (speed <= self.config.max_speed_mps)]
         if not len(speed):
             return best, point
-        course = course if self.sees_course else centre[2:3]
+        if not self.sees_course:
+            cpa_range, course = cpa_range[cpa_range >= 0.0], centre[2:3]
         grid = CourseGrid(cpa_time, cpa_range, speed, course, self.tiles, self.delay, scores)
         bounds = grid.bounds(self.threads)
         for cells in best_first(bounds):
@@ -408,8 +409,11 @@ class _Finder:
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         config = self.config
+        # Without azimuths both sides say the same: starboard stands for both, as in the volume of the prior.
+        least = -config.max_cpa_range_m if self.sees_course else 0.0
         return (
-            (abs(points[:, 1]) <= config.max_cpa_range_m)
+            (points[:, 1] >= least)
+            & (points[:, 1] <= config.max_cpa_range_m)
             & (points[:, 3] >= config.min_speed_mps)
             & (points[:, 3] <= config.max_speed_mps)
             & (points[:, 0] >= -1800.0)

@@ -340,6 +340,23 @@ def test_range_alone_finds_the_passage_but_no_course():
     assert np.isinf(found.std[2]) and np.isnan(found.row(1)["course_deg"])
 
 
+@pytest.mark.parametrize("distance", [600.0, 1200.0])
+def test_range_alone_tells_how_near_a_ship_passes_on_either_side(distance):
+    """Both sides fit alike: their mean would be a ship overhead."""
+    truth = StraightCourse(T0 + 7200.0, distance, 60.0, 9.0)
+    minutes = MINUTES[::3]
+    _, range_m, rate = heard(truth, minutes)
+    beside, slower = (RANGE - range_m[:, None]) / 150.0, (RATE - rate[:, None]) / 0.7
+    llr = 12.0 * np.exp(-0.5 * (beside[:, :, None] ** 2 + slower[:, None, :] ** 2)) - 3.0
+    maps = xr.Dataset(
+        {"range_llr": (("time", "range", "range_rate"), llr.astype(np.float32))},
+        coords={"time": from_posix(minutes), "range": RANGE, "range_rate": RATE},
+    )
+    (found,) = search(maps, SEGMENT, delay)
+    assert found.motion.cpa_range_m == pytest.approx(distance, abs=0.35 * distance)
+    assert found.std[1] < 0.5 * distance
+
+
 @pytest.mark.parametrize(("strength", "open"), [(1.2, True), (0.5, False)])
 def test_a_ghost_as_loud_as_the_ship_is_said(strength, open):
     """A course at twice the distance and speed has the same bearings."""
