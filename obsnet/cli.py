@@ -25,6 +25,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 
@@ -60,7 +61,7 @@ Jobs = Annotated[
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
-AisFile = Annotated[Path | None, typer.Option("--ais", help="AIS file, overlaid on the report.")]
+AisFile = Annotated[Path | None, typer.Option("--ais", help="AIS file, overlaid on what is drawn.")]
 CalibrationFile = Annotated[Path | None, typer.Option("--calibration", help="File of `obsnet calibrate`.")]
 Orientation = Annotated[
     float | None, typer.Option("--orientation", help="Azimuth of the first horizontal [deg].")
@@ -246,7 +247,9 @@ def simulate(
     hours: Annotated[float, typer.Option("--hours", min=0.1, help="Length of the record.")] = 8.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of everything that is drawn.")] = 0,
     ships: Annotated[int, typer.Option("--ships", min=0, help="Ships drawn at random.")] = 1,
-    ais: AisFile = None,
+    ais: Annotated[
+        Path | None, typer.Option("--ais", help="AIS file of the ships, in place of ships drawn at random.")
+    ] = None,
     station: Annotated[
         Path | None, typer.Option("--station", help="StationXML whose position and depth to use.")
     ] = None,

@@ -256,7 +256,10 @@ def _calibrated(
     config: Settings,
     **overrides: Any,
 ) -> tuple[Station, Settings, Amplitudes | None]:
-    """Station, parameters and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given."""
+    """Station, parameters and amplitudes of the pairs, after the file of ``obsnet calibrate`` if one was given.
+
+    What the user gives counts before what the calibration found, and that before the StationXML.
+    """
     station = read_station(path, code, **overrides)
     if calibration is None:
         return station, config, None
@@ -264,7 +267,7 @@ def _calibrated(
 
     fitted = Calibration.read(calibration)
     config = replace(config, ocean=fitted.ocean(config.ocean))
-    return fitted.apply(station), config, fitted.amplitudes
+    return fitted.apply(station).calibrated(**overrides), config, fitted.amplitudes
 
 
 def read_reference(path: Path, station: Station, max_cpa_m: float | None = 25e3, quiet: bool = False) -> list:

@@ -422,6 +422,13 @@ def test_a_defect_of_ours_is_not_dressed_as_bad_input(record, tmp_path, monkeypa
     assert not (tmp_path / "out").exists()
 
 
+def test_help_keeps_units(obsnet):
+    """Brackets are no markup."""
+    for command, unit in (("track", "[deg]"), ("evaluate", "[km]")):
+        _, told, _ = obsnet(command, "-h")
+        assert unit in "\n".join(told)
+
+
 def test_help_is_help(obsnet):
     for arguments in (["--help"], ["-h"], ["track", "-h"]):
         status, told, errors = obsnet(*arguments)

@@ -153,6 +153,7 @@ def iter_spectra(source: WaveformSource, config: SpectraConfig = SpectraConfig()
     """
     spans = _spans(source, config)
     builder = SpectraBuilder(source, config, spans[0][0], spans[-1][1])
+    source.report.left_aside.update(dict.fromkeys(builder.unused, "another sensor serves in its stead"))
     step = max(round(config.block_s / config.hop_s), 1)
     for first, last in spans:
         for begin in range(first, last, step):
@@ -216,6 +217,12 @@ class SpectraBuilder:
                 f"no channel of {source.station.code} has an epoch at the time of its waveforms, "
                 f"{iso(np.datetime64(int(centres[0]), 'ns'))}; give metadata of that time"
             )
+
+    @property
+    def unused(self) -> list[str]:
+        """SEED ids of the channels with waveforms that serve at no time."""
+        serving = {channel.seed_id for station in self._stations for channel in station.channels}
+        return sorted(self.source.timelines.keys() - serving)
 
     def _known(self, channel: Channel) -> bool:
         if not described(channel.response):

@@ -580,3 +580,18 @@ def test_a_real_ocean_bottom_record_has_plausible_levels():
         oracle = np.fft.rfft(cut * window)[band] * 2 / window.sum()
         mine = got[name].sel(time=middle).values[band]
         assert np.abs(mine - oracle).max() < 0.02 * np.abs(oracle).max()
+
+
+def test_a_sensor_that_serves_at_no_time_is_said_to_be_left_aside():
+    """Where two are described, one serves throughout, even where its waveforms end early."""
+    both = inventory([*standard(), *(channel(code, location="10") for code in ("BH1", "BH2", "BHZ"))])
+    record = four_channels(0.2)
+    beside = record.select(channel="BH*").copy()
+    for other in beside:
+        other.stats.location = "10"
+    for short in record.select(channel="BH*"):
+        short.trim(endtime=short.stats.starttime + 300)
+    opened = open_waveforms(record + beside, Station.from_stationxml(both))
+    list(iter_spectra(opened))
+    reason = "another sensor serves in its stead"
+    assert opened.report.left_aside == {other.id: reason for other in beside}
