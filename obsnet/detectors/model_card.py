@@ -77,6 +77,29 @@ OPERATORS = frozenset(
 )
 """Operators of the models; none reads files or runs code."""
 
+NUMBERS = {
+    "azimuth": (
+        "grids.minutes",
+        "grids.frequencies",
+        "grids.azimuths",
+        "representation.bin_s",
+        "representation.features.fmax_hz",
+        "representation.spectra.window_s",
+        "representation.spectra.hop_s",
+    ),
+    "range": (
+        "representation.features.range_step_m",
+        "representation.features.range_rate_step_mps",
+        "representation.spectra.window_s",
+        "representation.spectra.hop_s",
+        "representation.spectra.analysis_rate_hz",
+        "calibration.slope",
+    ),
+}
+"""What the card of each task must state as a number above 0; the calibration of an azimuth model is within its graph."""
+LISTS = {"azimuth": ("channels",), "range": ("context", "globals")}
+"""Of the representation, what must be a list of names."""
+
 
 @dataclass(frozen=True)
 class ModelCard:
@@ -109,13 +132,23 @@ class ModelCard:
         try:
             values = json.loads(text)
             card = cls(**values)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise ModelError(f"the card of {where} cannot be read: {error}; export the model again") from None
-        if card.task not in ("azimuth", "range") or not (
-            isinstance(card.representation, dict) and isinstance(card.grids, dict)
-        ):
-            raise ModelError(f"the card of {where} is incomplete; export the model again")
+        if card.task not in ("azimuth", "range"):
+            raise ModelError(f"the card of {where} is of no task of obsnet; export the model again")
+        lists = [f"representation.{name}" for name in LISTS[card.task]]
+        wanting = [name for name in NUMBERS[card.task] if not _is_positive(card.stated(name))]
+        wanting += [name for name in lists if not isinstance(card.stated(name), list)]
+        if wanting:
+            raise ModelError(f"the card of {where} is incomplete: {wanting[0]}; export the model again")
         return card
+
+    def stated(self, name: str) -> Any:
+        """What the card says at a dotted name; None where it says nothing."""
+        held: Any = vars(self)
+        for key in name.split("."):
+            held = held.get(key) if isinstance(held, dict) else None
+        return held
 
 
 @dataclass(frozen=True)
@@ -189,6 +222,10 @@ class ModelFile:
         except Exception as error:  # onnxruntime's errors share no class of their own
             line = " ".join(str(error).split())[:160]
             raise ModelError(f"onnxruntime cannot load {self.path}: {line}") from None
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, (int, float)) and 0 < value < np.inf
 
 
 def shipped(task: str) -> Path:

@@ -96,6 +96,9 @@ def finetune(
     labels = replace(labels, prior_odds=calibration.prior_odds)
     rows = AzimuthRows(prepared, "train", labels)
     check = AzimuthRows(prepared, "validation", labels)
+    for split, held in (("train", rows), ("validation", check)):
+        if not any(held.seen(item)[1].any() for item in range(len(held))):
+            raise ConfigError(f"no ship's place is known in any {split} record; prepare more days")
     old = {name: values.clone() for name, values in made.state_dict().items()}
     loss_before = held_out_loss(made, check, calibration, labels)
     _fit(made, prepared, rows, check, folder, labels, trainer)

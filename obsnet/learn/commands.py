@@ -77,7 +77,7 @@ def train_detector(config: DictConfig) -> float:
     from obsnet.learn.task import TrainerConfig
 
     values = plain(config)
-    folders = values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
+    folders = _sets(values)
     folder = Path(values["out"])
     trainer = build(TrainerConfig, values["trainer"], "trainer")
     about = {"resolved": values | {key: _names(values.get(key)) for key in PLACES}}
@@ -118,7 +118,7 @@ def export_detector(config: DictConfig) -> None:
     values = plain(config)
     export, parity = _exporting(values["weights"])
     path = export(values["weights"], values["out"], values["calibrate"])
-    worst = parity(values["weights"], path, values["prepared"], values["calibrate"])
+    worst = parity(values["weights"], path, _sets(values), values["calibrate"])
     say(f"{path}: {path.stat().st_size} bytes, differs from PyTorch by {worst:.1e} at most")
 
 
@@ -126,8 +126,13 @@ def verify_export(config: DictConfig) -> None:
     """Check the ONNX file of ``config.out`` against ``config.weights`` on real maps."""
     values = plain(config)
     _, parity = _exporting(values["weights"])
-    worst = parity(values["weights"], values["out"], values["prepared"], values["calibrate"])
+    worst = parity(values["weights"], values["out"], _sets(values), values["calibrate"])
     say(f"{values['out']}: differs from PyTorch by {worst:.1e} at most")
+
+
+def _sets(values: dict[str, Any]) -> list[str]:
+    """The prepared folders, of one name or a list."""
+    return values["prepared"] if isinstance(values["prepared"], list) else [values["prepared"]]
 
 
 def _exporting(weights: str) -> tuple[Callable[..., Any], Callable[..., float]]:

@@ -125,6 +125,10 @@ class PreparedSet:
         """Whether a record is there, whole."""
         return (self.folder / f"{name}.zarr").is_dir()
 
+    def empty(self) -> bool:
+        """Whether it holds no record."""
+        return not any(self.folder.glob("*.zarr"))
+
     def write(self, record: Record) -> None:
         """Store a record, whole or not at all."""
         target = self.folder / f"{record.id}.zarr"

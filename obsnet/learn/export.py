@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from obsnet.errors import ModelError
 from obsnet.learn.azimuth import ROW_CELLS, ROW_MINUTES, AzimuthRows, AzimuthTaskConfig
 from obsnet.learn.azimuth_training import restored
 from obsnet.learn.calibration import Calibration, bounded
-from obsnet.learn.dataset import PreparedSet
+from obsnet.learn.dataset import JoinedSets
 from obsnet.learn.networks import AzimuthNetwork, parameters
 from obsnet.output import write_text
 from obsnet.signals.spectra import SpectraConfig
@@ -93,20 +94,28 @@ def azimuth_card(network: AzimuthNetwork, calibration: Calibration, about: dict[
 
 
 def origin(network: Any, about: dict[str, Any]) -> dict[str, Any]:
-    """What a card says of how a network of either kind came to be."""
-    return {
+    """What a card says of how a network of either kind came to be.
+
+    Of adapted weights metrics, digest and commit are those of the adaptation; what the network was before stands in ``about``.
+    """
+    first = {
         "metrics": about["metrics"],
         "data_digest": about["data_digest"],
         "commit": about["made"]["commit"],
-        "about": {
-            "network": asdict(network.config),
-            "parameters": parameters(network),
-            "versions": about["made"]["versions"],
-            "trained_on": "simulated records of obsnet's twin"
-            if "finetune" not in about
-            else "simulated records, then a station's own passages",
-        },
     }
+    told: dict[str, Any] = {
+        "network": asdict(network.config),
+        "parameters": parameters(network),
+        "versions": about["made"]["versions"],
+        "trained_on": "simulated records of obsnet's twin",
+    }
+    tuned = about.get("finetune", {})
+    if not tuned.get("adapted"):
+        return first | {"about": told}
+    losses = {f"held_out_{key}": tuned[key] for key in ("loss_before", "loss_after")}
+    told |= {"trained_on": "simulated records, then a station's own passages", "before": first}
+    now = {"metrics": losses, "data_digest": tuned["data_digest"], "commit": tuned["set"]["commit"]}
+    return now | {"about": told}
 
 
 def write_onnx(
@@ -159,7 +168,11 @@ def record_digest(path: Path, digest: str) -> None:
 
 
 def parity(
-    weights: str | Path, model: str | Path, prepared: str | Path, calibrate: bool = True, rows: int = 24
+    weights: str | Path,
+    model: str | Path,
+    prepared: Sequence[str | Path],
+    calibrate: bool = True,
+    rows: int = 24,
 ) -> float:
     """Largest difference of the ONNX file from PyTorch on rows of validation records.
 
@@ -169,7 +182,7 @@ def parity(
     """
     network, calibration, _ = restored(weights)
     calibrated = CalibratedAzimuth(network, calibration if calibrate else RAW).eval()
-    held = AzimuthRows(PreparedSet(prepared), "validation", AzimuthTaskConfig())
+    held = AzimuthRows(JoinedSets(prepared), "validation", AzimuthTaskConfig())
     session = ModelFile.read(model, "azimuth").session()
     worst = 0.0
     for item in np.linspace(0, len(held) - 1, min(rows, len(held))).astype(int):

@@ -32,7 +32,7 @@ from obsnet.signals.station import Station
 from obsnet.signals.waveforms import open_waveforms
 from obsnet.twin.station import simulate
 
-Job = tuple[str, Callable[[], Record | None]]
+Job = tuple[str, Callable[[], Record]]
 
 QUIET_SEEDS = 50_000
 """Where the seeds of the records without ships begin."""
@@ -119,17 +119,27 @@ def fill(folder: str | Path, data: Any, jobs: Sequence[Job], progress: Any = Non
     Parameters
     ----------
     data : the configuration; a folder prepared with another is refused, but for more records.
-    jobs : name of each record, and what makes it (None where there is nothing to be made).
+    jobs : name of each record, and what makes it; one that raises `WaveformError` is passed over.
+
+    Raises
+    ------
+    WaveformError : there are waveforms for none of the records.
     """
     prepared = PreparedSet(folder)
     _check_same(prepared, data)
     prepared.folder.mkdir(parents=True, exist_ok=True)
     prepared.write_provenance(provenance(data))
+    missing: WaveformError | None = None
     for done, (name, make) in enumerate(jobs, 1):
-        if not prepared.has(name) and (made := make()) is not None:
-            prepared.write(made)
+        try:
+            if not prepared.has(name):
+                prepared.write(make())
+        except WaveformError as error:
+            missing = missing or error
         if progress is not None:
             progress(done, len(jobs))
+    if missing is not None and prepared.empty():
+        raise missing
     prepared.write_provenance(
         provenance(data) | {"digest": prepared.digest(), "records": len(prepared.names())}
     )
@@ -263,8 +273,8 @@ def _archive_jobs(data: ArchiveData) -> Iterator[tuple[str, str, tuple[float, fl
         yield f"archive-{stamp}", split, (start, stop)
 
 
-def archive_record(name: str, split: str, span: tuple[float, float], data: ArchiveData) -> Record | None:
-    """Prepare one stretch of a real archive; none where it holds no waveforms."""
+def archive_record(name: str, split: str, span: tuple[float, float], data: ArchiveData) -> Record:
+    """Prepare one stretch of a real archive; `WaveformError` where it holds no waveforms."""
     station = Station.from_stationxml(
         data.stationxml,
         data.code,
@@ -272,14 +282,11 @@ def archive_record(name: str, split: str, span: tuple[float, float], data: Archi
         hydrophone_polarity=data.hydrophone_polarity,
     )
     lead = max(span[0] - data.lead_s, parse_utc(data.start) / 1e9)
-    try:
-        source = open_waveforms(
-            data.waveforms, station, starttime=lead, endtime=span[1] + 180.0,
-            min_rate_hz=data.front_end.spectra.analysis_rate_hz,
-        )  # fmt: skip
-        arrays = front_end(source, station, data.front_end)
-    except WaveformError:
-        return None
+    source = open_waveforms(
+        data.waveforms, station, starttime=lead, endtime=span[1] + 180.0,
+        min_rate_hz=data.front_end.spectra.analysis_rate_hz,
+    )  # fmt: skip
+    arrays = front_end(source, station, data.front_end)
     place = (station.latitude, station.longitude)
     ais = read_ais(list(data.ais), near=place)
     seconds = to_posix(ais["time"].to_numpy())

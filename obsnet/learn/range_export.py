@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -44,7 +45,11 @@ def export_range(weights: str | Path, out: str | Path, calibrate: bool = True) -
 
 
 def range_parity(
-    weights: str | Path, model: str | Path, prepared: str | Path, calibrate: bool = True, examples: int = 100
+    weights: str | Path,
+    model: str | Path,
+    prepared: Sequence[str | Path],
+    calibrate: bool = True,
+    examples: int = 100,
 ) -> float:
     """Largest difference of the ONNX file from PyTorch on hypotheses of validation records; no calibration is in it.
 
@@ -53,9 +58,8 @@ def range_parity(
     ModelError : it exceeds `TOLERANCE`.
     """
     network, _, features, _ = restored(weights)
-    held = RangeExamples([PreparedSet(prepared)], "validation", RangeTaskConfig(features=features)).arrays[
-        "features"
-    ]
+    sets = [PreparedSet(folder) for folder in prepared]
+    held = RangeExamples(sets, "validation", RangeTaskConfig(features=features)).arrays["features"]
     chosen = np.linspace(0, len(held) - 1, min(examples, len(held))).astype(int)
     inputs = held[chosen].astype(np.float32).reshape(-1, features.size)
     with torch.no_grad():

@@ -23,6 +23,8 @@ from obsnet.twin.scenario import Passage, Scenario
 from obsnet.twin.sea import Ambient
 from obsnet.twin.ship import Ship
 
+SPLIT_SEEDS = 1_000_000
+"""What lies between the seeds of the splits: no split hears another's ships, noise or whales."""
 STATION = (-21.3732, 54.1294)
 """Latitude and longitude of station RR03, around which the AIS of package `obsea` lies."""
 NEVER_TRAINED = (parse_utc("2013-05-21") / 1e9, parse_utc("2013-05-27") / 1e9)
@@ -90,7 +92,9 @@ def draw_scene(
     seed: int, split: str, config: SceneConfig = SceneConfig(), courses: pd.DataFrame | None = None
 ) -> Scene:
     """Draw a scene; its ships are of the given split where they follow AIS."""
-    generator = np.random.default_rng([seed, 0xA21, list(SHARES).index(split)])
+    number_of_split = list(SHARES).index(split)
+    generator = np.random.default_rng([seed, 0xA21, number_of_split])
+    own = seed + SPLIT_SEEDS * number_of_split
     ocean = draw_ocean(generator, None, OceanSpread())
     start = parse_utc(config.start) / 1e9 + 60.0 * int(generator.integers(0, 1440))
     rate = float(generator.choice([50.0, 62.5, 100.0, 125.0], p=[0.8, 0.08, 0.08, 0.04]))
@@ -102,16 +106,16 @@ def draw_scene(
     passages: tuple[Passage, ...] = ()
     number = int(generator.choice(len(config.ship_shares), p=config.ship_shares))
     if courses is not None and number and generator.random() < config.real_course_share:
-        start, passages = _after_ais(generator, seed, split, config, courses, recorder)
+        start, passages = _after_ais(generator, own, split, config, courses, recorder)
     elif number:
         passages = tuple(
             Passage(
-                _ship(generator, 1000 * seed + i, 100000001 + i, config),
+                _ship(generator, 1000 * own + i, 100000001 + i, config),
                 _course(generator, start, config.hours),
             )
             for i in range(number)
         )
-    scenario = Scenario.random(seed, config.hours, 0, start, recorder=recorder, passages=passages)
+    scenario = Scenario.random(own, config.hours, 0, start, recorder=recorder, passages=passages)
     scenario = scenario.replace(ambient=_ambient(generator))
     return Scene(scenario, ocean, float(generator.normal(0.0, config.orientation_error_deg)))
 

@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("zarr")
 
 from obsnet.detectors.azimuth_features import CHANNELS, cell_index
+from obsnet.errors import WaveformError
 from obsnet.layout import from_posix, parse_utc
 from obsnet.learn.dataset import PreparedSet
 from obsnet.learn.labels import labels
@@ -69,6 +70,13 @@ def test_scenes_are_drawn_from_their_seed_and_differ():
     assert min(max(quiet), max(loud)) > 0.5 and max(min(quiet), min(loud)) < 0.4
 
 
+def test_no_split_hears_the_ships_or_the_noise_of_another():
+    config = SceneConfig(ship_shares=(0.0, 0.0, 1.0))
+    scenarios = [draw_scene(5, split, config).scenario for split in ("train", "validation", "test")]
+    assert len({scenario.seed for scenario in scenarios}) == 3
+    assert len({passage.ship.seed for scenario in scenarios for passage in scenario.passages}) == 6
+
+
 def test_ships_keep_to_their_split():
     found = [split_of(mmsi) for mmsi in range(200_000_000, 200_002_000)]
     assert 0.75 < found.count("train") / 2000 < 0.85
@@ -108,6 +116,21 @@ def test_an_archive_is_prepared_like_the_twin_and_goes_on(tmp_path):
     assert before == {name: (made.folder / f"{name}.zarr").stat().st_mtime_ns for name in names}
     first = PreparedSet(tmp_path / "set").read(names[0])
     assert first.minute[0] == start and len(first.cell_index) >= 85
+
+
+def test_an_archive_without_waveforms_says_why(tmp_path):
+    scenario = Scenario.random(5, 0.6, 1, START, recorder=Recorder(depth_m=3000.0), nuisances=False)
+    write_simulation(scenario, tmp_path / "archive")
+    held = {name: str(tmp_path / "archive" / name) for name in ("waveforms.mseed", "station.xml", "ais.csv")}
+    data = ArchiveData(
+        waveforms=str(tmp_path / "nowhere"), stationxml=held["station.xml"], ais=(held["ais.csv"],),
+        start="2012-11-01T00:00:00Z", end="2012-11-01T00:30:00Z", hours=0.5,
+    )  # fmt: skip
+    with pytest.raises(WaveformError, match="nowhere"):
+        prepare(tmp_path / "set", data)
+    early = replace(data, waveforms=held["waveforms.mseed"], start="2012-10-31T20:00:00Z")
+    names = prepare(tmp_path / "other", early).names()
+    assert "archive-2012-11-01T000000" in names and "archive-2012-10-31T230000" not in names
 
 
 def test_the_paper_s_week_is_never_trained_on():

@@ -115,7 +115,7 @@ def test_a_folder_belongs_to_one_training(trained, prepared):
 
 def test_the_exported_model_says_the_same_and_detects(trained, prepared, tmp_path):
     model = export_range(trained[0], tmp_path / "range.onnx")
-    assert range_parity(trained[0], model, prepared.folder) < 1e-4
+    assert range_parity(trained[0], model, [prepared.folder]) < 1e-4
     held = prepared.read("r2")
     detector = LearnedRangeDetector.from_model(held.table(), model)
     assert detector.file.card.task == "range"
@@ -186,7 +186,7 @@ def test_hydrophone_records_may_share_a_depth():
 
 def test_without_calibration_the_exported_ratios_are_the_networks_own(trained, prepared, tmp_path):
     raw = export_range(trained[0], tmp_path / "raw.onnx", calibrate=False)
-    assert range_parity(trained[0], raw, prepared.folder, calibrate=False) < 1e-4
+    assert range_parity(trained[0], raw, [prepared.folder], calibrate=False) < 1e-4
     held = prepared.read("r2")
     detector = LearnedRangeDetector.from_model(held.table(), raw)
     said, _ = detector.scores(cepstrogram_of(held), held.minute[5:8])

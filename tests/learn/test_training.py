@@ -144,13 +144,13 @@ def model(run, tmp_path_factory):
 
 
 def test_the_file_says_what_pytorch_says(run, prepared, model):
-    assert parity(run / "weights.pt", model, prepared.folder) < 1e-4
+    assert parity(run / "weights.pt", model, [prepared.folder]) < 1e-4
     assert model.stat().st_size < 2_000_000
 
 
 def test_without_calibration_the_file_says_what_the_network_says(run, prepared, tmp_path):
     raw = export(run / "weights.pt", tmp_path / "raw.onnx", calibrate=False)
-    assert parity(run / "weights.pt", raw, prepared.folder, calibrate=False) < 1e-4
+    assert parity(run / "weights.pt", raw, [prepared.folder], calibrate=False) < 1e-4
     assert ModelFile.read(raw, "azimuth").card.calibration["slope"] == [1.0, 1.0]
 
 
@@ -158,7 +158,7 @@ def test_parity_fails_for_other_weights(prepared, model, tmp_path):
     other = replace(TRAINER, seed=5, epochs=1)
     training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), other, say=lambda text: None)
     with pytest.raises(ModelError, match="differs"):
-        parity(tmp_path / "weights.pt", model, prepared.folder)
+        parity(tmp_path / "weights.pt", model, [prepared.folder])
 
 
 def test_the_card_travels_with_the_file(model, prepared):
@@ -233,6 +233,58 @@ def test_models_that_could_do_more_than_compute_are_refused(model, tmp_path):
 
     with pytest.raises(ModelError, match="no card"):
         ModelFile.read(altered(model, tmp_path / "cardless.onnx", cardless))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("grids", "minutes", None),
+        ("grids", "azimuths", float("nan")),
+        ("representation", "spectra", "x"),
+        ("representation", "features", {}),
+        ("representation", "channels", None),
+    ],
+)
+def test_a_card_that_says_too_little_is_refused(model, tmp_path, section, key, value):
+    def less(proto):
+        card = json.loads(proto.metadata_props[0].value)
+        card[section][key] = value
+        proto.metadata_props[0].value = json.dumps(card)
+
+    with pytest.raises(ModelError, match=f"incomplete: {section}.{key}"):
+        ModelFile.read(altered(model, tmp_path / "less.onnx", less))
+
+
+def test_the_card_of_an_adapted_model_tells_of_the_adaptation(run, prepared, tmp_path):
+    about = load_weights(run / "weights.pt")[1]
+    tuned = {
+        "adapted": 1.0,
+        "loss_before": 2.0,
+        "loss_after": 1.5,
+        "data_digest": "d",
+        "set": {"commit": "c"},
+    }
+    for adapted in (1.0, 0.0):
+        network = training.restored(run / "weights.pt")[0]
+        told = about | {"finetune": tuned | {"adapted": adapted}}
+        training.save_weights(tmp_path / "weights.pt", network, told)
+        card = ModelFile.read(export(tmp_path / "weights.pt", tmp_path / "azimuth.onnx")).card
+        if adapted:
+            assert (card.data_digest, card.commit) == ("d", "c")
+            assert card.metrics == {"held_out_loss_before": 2.0, "held_out_loss_after": 1.5}
+            assert card.about["before"]["data_digest"] == prepared.digest()
+        else:
+            assert card.data_digest == prepared.digest() and card.metrics == about["metrics"]
+            assert "own passages" not in card.about["trained_on"]
+
+
+def test_passages_of_which_nothing_is_known_adapt_nothing(run, tmp_path):
+    made = PreparedSet(tmp_path / "set")
+    for split in ("train", "validation"):
+        silent = made_record(split, split, split == "train", 1)
+        made.write(Record(silent.attributes | {"absence_known": False}, silent.arrays))
+    with pytest.raises(ConfigError, match="validation"):
+        training.finetune(made, tmp_path / "run", run / "weights.pt", say=lambda text: None)
 
 
 def test_finetuning_keeps_the_old_weights_unless_held_out_passages_are_better(run, prepared, tmp_path):
