@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from obsnet.archive.day import DayTask, detect_day, one_line
-from obsnet.archive.ledger import Day, Ledger
+from obsnet.archive.ledger import COUNTS, Day, Ledger
 from obsnet.archive.tracks import TracksTask, find_day_tracks, forget, tracks_tasks
 from obsnet.archive.workers import Task, Workers, dask_workers, local_workers
 from obsnet.console import counted
@@ -153,8 +153,8 @@ class _Campaign:
         tasks: list[Task] = []
         for code in codes:
             for day in (Day(code, date) for date in self.dates):
-                entry = self.ledger.read(day)
-                if entry is not None and entry["status"] == "done":
+                entry = self.ledger.finished(day)
+                if entry is not None:
                     self.entries[day] = entry
                 elif day.date not in held[code]:
                     self.entries[day] = {"status": "no data"}
@@ -183,7 +183,7 @@ class _Campaign:
     def _tracking(self, code: str) -> Iterator[Task]:
         """Tracking tasks of a station whose days are complete; those whose segments are as before are not repeated."""
         dates = sorted(path.stem for path in (self.ledger.folder / "days" / code).glob("????-??-??.json"))
-        done = [date for date in dates if (self.ledger.read(Day(code, date)) or {}).get("status") == "done"]
+        done = [date for date in dates if self.ledger.finished(Day(code, date))]
         wanted = tracks_tasks(self.ledger, self.config, code, done)
         for path in (self.ledger.folder / "days" / code).glob("*.tracks.json"):
             day = Day(code, path.name.removesuffix(".tracks.json"))
@@ -191,7 +191,7 @@ class _Campaign:
                 forget(self.ledger, day)
         for task in wanted:
             entry = self.ledger.read(task.day, "tracks")
-            if entry is not None and entry["status"] == "done" and entry["digest"] == task.digest:
+            if entry is not None and entry["status"] == "done" and entry.get("digest") == task.digest:
                 self.found[task.day] = entry
             else:
                 yield find_day_tracks, task
@@ -213,8 +213,7 @@ class _Campaign:
                 row |= {"status": "failed", "error": tracks["error"]}
             table.append(row)
         frame = pd.DataFrame(table, columns=REPORT_COLUMNS)
-        counts = ("minutes", "azimuths", "ranges", "tracks", "bytes")
-        return frame.astype(dict.fromkeys(counts, "Int64"))
+        return frame.astype(dict.fromkeys(COUNTS, "Int64"))
 
 
 def _dates(start: str, end: str) -> list[str]:

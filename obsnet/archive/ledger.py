@@ -37,6 +37,8 @@ from obsnet.pipeline import RunConfig
 DAY_S = 86400.0
 UNFINISHED = ".unfinished-"
 """Beginning of the names of files and folders that are still being written."""
+COUNTS = ("minutes", "azimuths", "ranges", "tracks", "bytes")
+"""What records count."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,20 @@ class Ledger:
             found = json.loads(self.record(day, stage).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return found if isinstance(found, dict) else None
+        return found if _is_record(found) else None
+
+    def finished(self, day: Day) -> dict[str, Any] | None:
+        """The record of a day that is done and whose minutes are there; None where it is to be computed (again)."""
+        import pyarrow.parquet
+
+        entry = self.read(day)
+        if entry is None or entry["status"] != "done":
+            return None
+        try:
+            pyarrow.parquet.read_metadata(self.detections(day))
+        except (OSError, ValueError):  # lost, or cut short
+            return None
+        return entry
 
     def write(self, day: Day, entry: dict[str, Any], stage: str = "") -> None:
         """Write a day's record, after all that it speaks of."""
@@ -182,6 +197,14 @@ def put(frame: Any, path: Path) -> int:
             partial.unlink(missing_ok=True)
         raise OutputError(f"cannot write {path}: {error.strerror or error}; make room for it") from None
     return path.stat().st_size
+
+
+def _is_record(found: Any) -> bool:
+    return (
+        isinstance(found, dict)
+        and isinstance(found.get("status"), str)
+        and all(isinstance(found.get(name, 0), int) for name in COUNTS)
+    )
 
 
 def _canonical(inventory: Any) -> bytes:

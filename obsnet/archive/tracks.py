@@ -22,7 +22,7 @@ import obsnet
 from obsnet.archive.day import known_station, one_line, table_of
 from obsnet.archive.ledger import DAY_S, Day, Ledger, put
 from obsnet.detectors.maps import joined
-from obsnet.errors import ObsnetError, OutputError
+from obsnet.errors import LayoutError, ObsnetError, OutputError
 from obsnet.layout import iso, to_posix
 from obsnet.ocean.rays import travel_time
 from obsnet.pipeline import RunConfig
@@ -162,10 +162,18 @@ def _maps(ledger: Ledger, days: list[Day]) -> xr.Dataset:
 
 
 def _minutes(ledger: Ledger, days: list[Day]) -> pd.DataFrame:
-    rows = pd.concat(
-        [pd.read_parquet(ledger.detections(day), partitioning=None) for day in days], ignore_index=True
-    )
+    rows = pd.concat([_of_day(ledger, day) for day in days], ignore_index=True)
     return rows.assign(time=rows["time"].dt.tz_localize(None).astype("datetime64[ns]"))
+
+
+def _of_day(ledger: Ledger, day: Day) -> pd.DataFrame:
+    path = ledger.detections(day)
+    try:
+        return pd.read_parquet(path, partitioning=None)
+    except (OSError, ValueError) as error:
+        raise LayoutError(
+            f"{path} cannot be read ({one_line(error)}); remove it, and the day is computed anew"
+        ) from None
 
 
 def _presence(rows: pd.DataFrame) -> pd.DataFrame:

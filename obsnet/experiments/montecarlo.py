@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from typing import Any, TypeVar
 
 import numpy as np
 
+from obsnet.beside import leave_signals_to_parent
 from obsnet.config import require_seed
-from obsnet.errors import ConfigError
+from obsnet.errors import ConfigError, WorkerDied
 
 Outcome = TypeVar("Outcome")
 Progress = Callable[[int, int], None]
@@ -58,6 +58,8 @@ def run(
     ------
     ConfigError
         `runs`, `seed` or `jobs` is out of range.
+    WorkerDied
+        A process did not live to say what its runs gave.
     Exception
         What a trial raises; the other runs end there, as they do on an interruption.
     """
@@ -75,17 +77,18 @@ def run(
     with ProcessPoolExecutor(
         min(jobs, runs),
         multiprocessing.get_context("spawn"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
+        initializer=leave_signals_to_parent,
     ) as pool:
         futures = [pool.submit(_one, trial, sequence, tuple(arguments)) for sequence in sequences]
         try:
             _follow(futures, progress)
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in set(multiprocessing.active_children()) - before:
                 worker.terminate()
                 worker.join()
+            if isinstance(error, BrokenExecutor):
+                raise WorkerDied("a process of the runs died (out of memory?); give fewer --jobs") from None
             raise
         return [future.result() for future in futures]
 

@@ -88,8 +88,17 @@ class LiveStation:
         self._rested = time.monotonic()
         self._late_since: float | None = None
         self._told = -np.inf
-        self._restore()
-        self._look()
+        try:
+            self._restore()
+            self._look()
+        except (ObsnetError, AttributeError, LookupError, TypeError, ValueError) as error:
+            self.store.close()
+            if isinstance(error, ObsnetError):
+                raise
+            what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise OutputError(
+                f"cannot go on from what {self.store.path} holds ({what}); move a damaged file away"
+            ) from None
 
     def run(self, source: Source, once: bool = False) -> None:
         """Take packets until the source ends or `stopping` is set; at the end of a record close it, if `once`."""

@@ -128,8 +128,8 @@ class Store:
 
     def packets(self) -> Iterator[Packet]:
         """The packets kept, in the order in which they came."""
-        rows = self._db.execute("SELECT seed_id, start_ns, rate, dtype, samples FROM packets ORDER BY number")
-        for seed_id, start_ns, rate, dtype, samples in rows.fetchall():
+        rows = self.rows("SELECT seed_id, start_ns, rate, dtype, samples FROM packets ORDER BY number")
+        for seed_id, start_ns, rate, dtype, samples in rows:
             yield Packet(seed_id, start_ns, rate, np.frombuffer(samples, np.dtype(dtype)))
 
     def forget_packets(self, before_ns: int) -> None:
@@ -155,9 +155,7 @@ class Store:
     def arrays(self, room: str) -> dict[str, np.ndarray]:
         """The arrays kept by `put_arrays`."""
         prefix = f"{room}/"
-        rows = self._db.execute(
-            "SELECT name, value FROM state WHERE substr(name, 1, ?) = ?", (len(prefix), prefix)
-        )
+        rows = self.rows("SELECT name, value FROM state WHERE substr(name, 1, ?) = ?", (len(prefix), prefix))
         found = {name: from_bytes(value) for name, value in rows}
         self._written |= found
         return {name.removeprefix(prefix): value for name, value in found.items()}
@@ -174,12 +172,15 @@ class Store:
 
     def noted(self, name: str, default: Any = None) -> Any:
         """A value kept by `note`."""
-        row = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
-        return default if row is None else json.loads(row[0])
+        held = self.rows("SELECT value FROM state WHERE name = ?", (name,))
+        return json.loads(held[0][0]) if held else default
 
     def rows(self, query: str, parameters: tuple = ()) -> list[tuple]:
-        """Answer of a query."""
-        return self._db.execute(query, parameters).fetchall()
+        """Answer of a query; `OutputError` where the file is damaged."""
+        try:
+            return self._db.execute(query, parameters).fetchall()
+        except sqlite3.Error as error:
+            raise OutputError(f"cannot read {self.path}: {error}; move a damaged file away") from None
 
     def execute(self, statement: str, parameters: tuple = ()) -> None:
         """Run a statement within a transaction."""

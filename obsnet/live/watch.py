@@ -46,6 +46,11 @@ def watch_source(
     ------
     ObsnetError : source, station, configuration or folder cannot serve.
     """
+    if station.moved:
+        say(
+            f"note: {station.code} lay in several places: the last one serves, "
+            f"{station.latitude:g}, {station.longitude:g}, {station.depth_m:g} m deep"
+        )
     if check:
         from obsnet.pipeline import Pipeline
 

@@ -77,7 +77,7 @@ def make_app(folder: RunFolder | LiveFolder, hosts: list[str] | None = None) -> 
     app = Starlette(
         routes=routes,
         middleware=middleware,
-        exception_handlers={HTTPException: _refuse, ObsnetError: _trouble},
+        exception_handlers={HTTPException: _refuse, ObsnetError: _trouble, OSError: _trouble},
     )
     app.state.folder = folder
     return app

@@ -166,6 +166,8 @@ class LiveFolder(_Folder):
             status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             status = {}
+        if not isinstance(status, dict):
+            status = {}
         with self._database() as database:
             (first,) = database.execute("SELECT min(time) FROM detections").fetchone()
             # the last one written: a clock that was set back leaves later times before it

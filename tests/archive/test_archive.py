@@ -146,6 +146,41 @@ def test_tracks_are_found_anew_when_a_missing_day_comes(night, config, tmp_path)
     pd.testing.assert_frame_equal(pd.read_parquet(out / "tracks"), pd.read_parquet(whole / "tracks"))
 
 
+@pytest.mark.parametrize("said", ["{}", "[]", "", '{"status": "done", "minutes": "all"}'])
+def test_a_record_that_says_nothing_is_made_anew(command, sds, tmp_path, said):
+    out = tmp_path / "out"
+    assert command(sds, out, "--jobs", "1")[0] == 0
+    (held,) = (out / "days").rglob("2013-05-21.json")
+    before = pd.read_parquet(out / "detections")
+    held.write_text(said)
+    status, lines, errors = command(sds, out, "--jobs", "1")
+    assert (status, errors) == (0, []) and "1 computed now" in "".join(lines)
+    pd.testing.assert_frame_equal(pd.read_parquet(out / "detections"), before)
+
+
+@pytest.mark.parametrize("left", [0, 1000, None])
+def test_a_day_whose_minutes_are_lost_or_cut_short_is_computed_again(command, sds, tmp_path, left):
+    out = tmp_path / "out"
+    assert command(sds, out, "--jobs", "1")[0] == 0
+    before = pd.read_parquet(out / "detections")
+    (minutes,) = (out / "detections").rglob("*.parquet")
+    whole = minutes.read_bytes()
+    minutes.unlink() if left is None else minutes.write_bytes(whole[:left])
+    status, lines, errors = command(sds, out, "--jobs", "1")
+    assert (status, errors) == (0, []) and "1 computed now" in "".join(lines)
+    pd.testing.assert_frame_equal(pd.read_parquet(out / "detections"), before)
+
+
+def test_minutes_that_are_damaged_within_are_one_line(command, sds, tmp_path):
+    out = tmp_path / "out"
+    assert command(sds, out, "--jobs", "1")[0] == 0
+    (minutes,) = (out / "detections").rglob("*.parquet")
+    whole = minutes.read_bytes()
+    minutes.write_bytes(whole[:4] + bytes(2000) + whole[2004:])
+    status, _, errors = command(sds, out, "--jobs", "1")
+    assert status == 2 and len(errors) == 1 and "minutes.parquet cannot be read" in errors[0]
+
+
 def test_a_bad_day_is_reported_and_the_rest_is_done(command, three_days, tmp_path):
     status, lines, errors = command(three_days, tmp_path / "out", "--jobs", "2", end="2013-05-25")
     assert (status, errors) == (3, [])

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from obsnet.errors import ConfigError, FilterError
+from obsnet.errors import ConfigError, FilterError, WorkerDied
 from obsnet.experiments import montecarlo
 
 
@@ -35,6 +35,47 @@ def test_progress_counts_every_run_once(jobs):
     seen = []
     montecarlo.run(draw, runs=3, seed=0, jobs=jobs, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def end_abruptly(rng):
+    os._exit(9)
+
+
+def test_a_process_that_dies_is_an_error_of_its_own():
+    with pytest.raises(WorkerDied):
+        montecarlo.run(end_abruptly, runs=4, seed=0, jobs=2)
+
+
+def say_and_wait(rng, folder):
+    (folder / f"{os.getpid()}").touch()
+    time.sleep(60.0)
+
+
+def wait_for(wish, seconds=30.0):
+    until = time.monotonic() + seconds
+    while not wish():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_runs_end_with_the_process_that_wants_them(tmp_path):
+    wanting = multiprocessing.get_context("spawn").Process(
+        target=montecarlo.run, args=(say_and_wait, 2, 0, 2, None, (tmp_path,))
+    )
+    wanting.start()
+    wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
+    wanting.kill()
+    wanting.join()
+    wait_for(lambda: not any(is_alive(int(path.name)) for path in tmp_path.iterdir()))
+
+
+def is_alive(number):
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    with open(f"/proc/{number}/stat") as file:
+        return file.read().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -4,7 +4,9 @@ import errno
 import json
 import os
 import resource
+import sqlite3
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from obsnet.live.store import Store, from_bytes, to_bytes
 from obsnet.pipeline import RunConfig
 from obsnet.run import detections_csv
 
-from .conftest import SMALL, Given, differences, packets, rows
+from .conftest import SMALL, Given, by_eight, differences, packets, rows
 
 
 def in_order(hour, seconds=8.0):
@@ -189,6 +191,39 @@ def test_a_damaged_database_is_one_line(tmp_path):
     (tmp_path / "obsnet.sqlite").write_bytes(b"not a database at all" * 100)
     with pytest.raises(OutputError, match=r"cannot use .*obsnet\.sqlite"):
         Store(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE state SET value = '{' WHERE name = 'position'",
+        "UPDATE state SET value = '[1]' WHERE name = 'position'",
+        "UPDATE state SET value = '{}' WHERE name = 'snapshot'",
+        "UPDATE state SET value = substr(value, 1, 40) WHERE name LIKE 'pipeline/%'",
+    ],
+)
+def test_a_damaged_memory_is_one_line(live, hour, tmp_path, damage):
+    first = live()
+    first.run(Given(by_eight(packets(hour.slice(endtime=hour[0].stats.starttime + 1200), lambda: 60.0))))
+    first.close()
+    with closing(sqlite3.connect(tmp_path / "live" / "obsnet.sqlite")) as database:
+        assert database.execute(damage).rowcount > 0
+        database.commit()
+    for _ in range(2):  # the folder is not held by the one that failed
+        with pytest.raises(OutputError, match="move a damaged file away"):
+            live()
+
+
+def test_a_database_that_is_damaged_within_is_one_line(live, hour, tmp_path):
+    live().run(Given(by_eight(packets(hour, lambda: 60.0))), once=True)
+    live().close()
+    path = tmp_path / "live" / "obsnet.sqlite"
+    held = bytearray(path.read_bytes())
+    for start in range(8192, len(held), 4096):
+        held[start : start + 200] = b"\xff" * 200
+    path.write_bytes(held)
+    with pytest.raises(OutputError, match="damaged"):
+        live()
 
 
 def test_arrays_are_stored_without_pickles():

@@ -1,5 +1,6 @@
 """The command ``obsnet watch``: what it refuses, what it checks, how it ends."""
 
+import copy
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from obspy import UTCDateTime
 
 from .conftest import differences, rows
 
@@ -117,3 +119,27 @@ def test_the_configuration_of_the_docs_is_one(tmp_path, obsnet, record):
     given = ("watch", tmp_path, "--station", record / "station.xml", "--out", tmp_path / "out", "--check")
     status, _, errors = obsnet(*given, "--config", tmp_path / "station.yaml")
     assert (status, errors) == (0, [])
+
+
+def test_which_place_serves_of_a_station_that_was_moved_is_said(obsnet, record, inventory, tmp_path):
+    moved = inventory.copy()
+    again = copy.deepcopy(moved[0][0])
+    before, again.start_date = moved[0][0], UTCDateTime(2022, 1, 1)
+    again.latitude = before.latitude + 1.0
+    before.end_date = again.start_date
+    for first, second in zip(before, again, strict=True):
+        first.end_date, second.start_date, second.latitude = (
+            again.start_date,
+            again.start_date,
+            again.latitude,
+        )
+        second.end_date = None
+    moved[0].stations.append(again)
+    moved.write(str(tmp_path / "moved.xml"), format="STATIONXML")
+    for station, notes in ((record / "station.xml", 0), (tmp_path / "moved.xml", 1)):
+        status, lines, errors = obsnet(
+            "watch", record, "--station", station, "--out", tmp_path / "out", "--check"
+        )
+        assert (status, errors) == (0, [])
+        said = [line for line in lines if f"the last one serves, {again.latitude:g}" in line]
+        assert len(said) == notes

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -102,6 +103,25 @@ def test_a_database_that_is_none_is_said_in_one_line(station_folder, listening):
         and "cannot read" in answer.json()["error"]
         and "Traceback" not in answer.text
     )
+
+
+def test_a_folder_that_goes_away_is_said_in_one_line(finished, listening, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    with listening(folder) as address:
+        shutil.rmtree(folder)
+        for path in ("api/about", "api/strips", "files/tracks.csv"):
+            answer = httpx.get(f"{address}/{path}")
+            assert answer.status_code == 503 and str(folder) in answer.json()["error"]
+
+
+@pytest.mark.parametrize("said", ["[]", "3", "null", "{"])
+def test_a_status_that_is_none_is_none(station_folder, listening, said):
+    folder, _ = station_folder
+    (folder / "status.json").write_text(said)
+    with listening(folder) as address:
+        about = httpx.get(f"{address}/api/about").json()
+    assert about["healthy"] is False and "no status.json" in about["trouble"]
 
 
 def test_strips_are_the_maps(page, finished):
