@@ -410,7 +410,7 @@ class Pipeline:
         def order(held: xr.DataArray, minutes: np.ndarray, null: np.ndarray | None) -> list[Future]:
             return self._ordered("azimuth", held, minutes, null)
 
-        return Azimuths(estimator, config.azimuth, config.spectra.hop_s, learned, order)
+        return Azimuths(estimator, config.azimuth, learned, order)
 
     def _by_polarisation(self) -> Azimuths:
         return self._by(replace(self.config.azigram, method="polarisation"))

@@ -190,7 +190,7 @@ class AnalyticAzimuthDetector:
             )  # fmt: skip
             before = np.concatenate([np.zeros((1, len(angle))), np.cumsum(said, axis=0)])
             llr = before[stop] - before[start]
-        covered = coverage(~np.isnan(real).all(axis=0), start, stop, minutes, config.window_s, hop_s)
+        covered = coverage(~np.isnan(real).all(axis=0), times, minutes, config.window_s)
         llr[covered == 0] = np.nan
         return azimuth_maps(llr, covered, minutes, config.azimuth, 360 // fold)
 
@@ -255,7 +255,7 @@ class AnalyticRangeDetector:
                 scores, bank.margin, start[part], stop[part], times, minutes[part], config.range_step_m, config.range_rate
             )  # fmt: skip
             llr[part] = bank.wandering(beam).transpose(0, 2, 1)
-        covered = coverage(valid, start, stop, minutes, config.window_s, hop(times))
+        covered = coverage(valid, times, minutes, config.window_s)
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from obsnet.detectors.analytic import AzimuthDetectorConfig
 from obsnet.detectors.background import BackgroundDirection
-from obsnet.detectors.maps import coverage, window_bounds
+from obsnet.detectors.maps import coverage
 from obsnet.layout import to_posix
 from obsnet.signals.azigram import AzigramConfig, azigram
 from obsnet.signals.held import followed_by, laid_out, taken_up, under
@@ -28,7 +28,6 @@ class Azimuths:
     Parameters
     ----------
     estimator : AzigramConfig. detector : AzimuthDetectorConfig.
-    hop_s : s from frame to frame.
     learned : the detector, where it is not the analytic one.
     order : has the analytic detector's maps made of an azigram (frequency, time), minutes [s since 1970] and the null (frequency, time).
     """
@@ -37,12 +36,11 @@ class Azimuths:
         self,
         estimator: AzigramConfig,
         detector: AzimuthDetectorConfig,
-        hop_s: float,
         learned: LearnedAzimuthDetector | None,
         order: Callable[[xr.DataArray, np.ndarray, np.ndarray | None], list[Future]],
     ) -> None:
         self.learned = learned
-        self._estimator, self._detector, self._hop_s, self._order = estimator, detector, hop_s, order
+        self._estimator, self._detector, self._order = estimator, detector, order
         self._background = BackgroundDirection(
             detector.background_window_s, detector.background_step_s, detector.background_prior_s
         )
@@ -75,10 +73,10 @@ class Azimuths:
         if self.learned is None:
             return self._order(held, minutes, self._null)
         window_s = self._detector.window_s
-        bounds = window_bounds(to_posix(held["time"].values), minutes, window_s)
         heard = ~np.isnan(held.values).all(axis=0)
+        covered = coverage(heard, to_posix(held["time"].values), minutes, window_s)
         made: Future = Future()
-        made.set_result(self.learned.maps(minutes, coverage(heard, *bounds, minutes, window_s, self._hop_s)))
+        made.set_result(self.learned.maps(minutes, covered))
         return [made]
 
     def forget(self, before: float) -> None:

@@ -19,7 +19,7 @@ import xarray as xr
 from obsnet.config import build
 from obsnet.detectors import range_kernels as kernels
 from obsnet.detectors.analytic import AnalyticRangeDetector, RangeDetectorConfig, range_maps
-from obsnet.detectors.maps import coverage, hop, window_bounds
+from obsnet.detectors.maps import coverage, window_bounds
 from obsnet.detectors.model_card import ModelCard, ModelFile, check_shapes, run, shipped
 from obsnet.detectors.range_features import CONTEXT, GLOBALS, RangeFeatures, RangeFeaturesConfig
 from obsnet.errors import ConfigError, ModelError
@@ -170,9 +170,7 @@ class LearnedRangeDetector:
             llr[part] = self._on_grid(coarse)
         if self._shape is not None:
             self._share_out(llr, self._shape, cepstrogram, minutes, np.flatnonzero(told))
-        covered = coverage(
-            ~np.isnan(cepstrogram.values[0]), start, stop, minutes, config.window_s, hop(times)
-        )
+        covered = coverage(~np.isnan(cepstrogram.values[0]), times, minutes, config.window_s)
         llr[covered == 0] = np.nan
         return range_maps(llr, covered, minutes, config.range_m, config.range_rate)
 

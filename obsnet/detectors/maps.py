@@ -109,21 +109,29 @@ def range_rate_axis(max_range_rate_mps: float, step_mps: float) -> np.ndarray:
     return np.arange(-half, half + 1) * step_mps
 
 
-def coverage(
-    valid: np.ndarray, start: np.ndarray, stop: np.ndarray, minutes: np.ndarray, window_s: float, hop_s: float
-) -> np.ndarray:
+def coverage(valid: np.ndarray, frame_time: np.ndarray, minutes: np.ndarray, window_s: float) -> np.ndarray:
     """Share of the frames that a window should hold and does, 0 to 1 (float32).
 
     Parameters
     ----------
     valid : bool array (n_frames), frames with data.
-    start, stop : from `window_bounds`.
-    minutes : s since 1970. window_s, hop_s : s; frames lie on UTC multiples of `hop_s` plus a constant.
+    frame_time : s since 1970; frames lie on multiples of the hop plus a constant, those without data may be left out.
+    minutes : s since 1970. window_s : s; windows as of `window_bounds`.
     """
+    start, stop = window_bounds(frame_time, minutes, window_s)
     total = np.concatenate([[0], np.cumsum(valid)])
-    expected = np.round(window_s / hop_s)
     found = total[stop] - total[start]
-    return np.minimum(found / expected, 1.0).astype(np.float32)
+    # In whole microseconds, so that frames on a window's edge count alike wherever the record begins.
+    step = round(1e6 * hop(frame_time))
+    first = _microseconds(frame_time[:1]).sum()
+    low, high = (
+        -((first + 1 - _microseconds(minutes + side * window_s / 2)) // step) for side in (-1.0, 1.0)
+    )
+    return np.minimum(found / np.maximum(high - low, 1), 1.0).astype(np.float32)
+
+
+def _microseconds(time: np.ndarray) -> np.ndarray:
+    return np.rint(1e6 * np.asarray(time, float)).astype(np.int64)
 
 
 def log_mean_exp(

@@ -11,6 +11,7 @@ from obsnet.detectors.analytic import (
     RangeDetectorConfig,
     cepstral_model,
 )
+from obsnet.detectors.maps import coverage
 from obsnet.errors import ConfigError
 from obsnet.layout import from_posix
 from obsnet.ocean.amplitudes import Amplitudes
@@ -148,7 +149,7 @@ def test_gap_costs_coverage_not_zeros():
     assert silent.any() and np.all(covered[silent] == 0)
     assert np.isnan(maps["azimuth_llr"].values[silent]).all()
     whole = (minutes - 90 >= times[0]) & (minutes + 90 <= times[39])
-    assert np.all(covered[whole] > 0.94)
+    assert np.all(covered[whole] == 1.0)
 
 
 def test_window_that_a_product_cannot_hold_is_refused():
@@ -256,3 +257,20 @@ def test_model_amplitude_follows_table_ii():
 def test_wrong_parameters_are_refused(arguments):
     with pytest.raises(ConfigError):
         AzimuthDetectorConfig(**arguments)
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.7e9, 1.7e9 + 4.96])
+def test_a_window_without_a_gap_is_covered_in_full(begin):
+    frame_time = begin + 10.24 * np.arange(2000)
+    minutes = np.arange(np.ceil(begin / 60.0) + 2.0, (frame_time[-1] - 95.0) // 60.0) * 60.0
+    valid = np.ones(len(frame_time), bool)
+    assert (coverage(valid, frame_time, minutes, 180.0) == 1.0).all()
+    valid[1000] = False
+    held = np.abs(minutes - frame_time[1000]) < 90.0
+    short = coverage(valid, frame_time, minutes, 180.0)
+    assert (short[~held] == 1.0).all() and (abs(short[held] - 17 / 18) < 0.004).all()
+    np.testing.assert_array_equal(coverage(valid[valid], frame_time[valid], minutes, 180.0), short)
+    apart = [
+        coverage(valid[part], frame_time[part], minutes[5:20], 180.0) for part in (slice(None), slice(3, 500))
+    ]
+    np.testing.assert_array_equal(*apart)
