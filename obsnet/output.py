@@ -54,7 +54,7 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
         _sweep(target)
         stage = Path(tempfile.mkdtemp(prefix=".unfinished-", suffix=".tmp", dir=target))
         try:
-            with _locked(stage):
+            with locked(stage):
                 yield stage
             _move(stage, target, leftovers)
         except OutputError as error:
@@ -68,8 +68,8 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
 
 
 @contextmanager
-def _locked(folder: Path, alone: bool = False) -> Iterator[None]:
-    """Hold a lock on a folder; `OSError` where it is to be held `alone` and another holds it."""
+def locked(folder: Path, alone: bool = False) -> Iterator[None]:
+    """Hold a lock on a folder, as long as the process lives; `OSError` where it is to be held `alone` and another holds it."""
     if os.name != "posix":
         if alone:
             raise OSError("folders cannot be locked here: what a killed run left stays")
@@ -88,7 +88,7 @@ def _locked(folder: Path, alone: bool = False) -> Iterator[None]:
 def _sweep(folder: Path) -> None:
     """Remove what a run that was killed has left: its lock went with it. What is young may not be locked yet."""
     for path in folder.glob(".unfinished-*.tmp"):
-        with suppress(OSError), _locked(path, alone=True):
+        with suppress(OSError), locked(path, alone=True):
             if time.time() - path.stat().st_mtime > _YOUNG_S:
                 shutil.rmtree(path, ignore_errors=True)
 

@@ -229,6 +229,11 @@ def _dates(start: str, end: str) -> list[str]:
         edges.append(stamp.astype("datetime64[D]"))
     if not edges[0] < edges[1]:
         raise ConfigError(f"the start {start} is not before the end {end}; the end is not included")
+    today = np.datetime64("now", "D")
+    if edges[1] > today:
+        raise ConfigError(
+            f"the end {end} lies ahead: a day is computed once, when it is over; give an end of {today} at the latest"
+        )
     return [str(date) for date in np.arange(*edges)]
 
 

@@ -121,7 +121,7 @@ def _examples(sets: Sequence[PreparedSet], split: str, config: RangeTaskConfig) 
     parts = [
         range_examples(
             cepstrogram_of(record), record.table(), truth_of(record), np.random.default_rng(number),
-            config.examples, config.features, known=known_minutes(record),
+            config.examples, config.features, known=known_minutes(record, config.features.range_m[-1]),
         )
         for number, record in enumerate(range_records(sets, split))
     ]  # fmt: skip
@@ -269,7 +269,7 @@ def finish(
             cepstrogram_of(record),
             record.table(),
             truth_of(record),
-            known_minutes(record),
+            known_minutes(record, task.features.range_m[-1]),
             task.features,
             look=task.look,
         )
@@ -336,10 +336,9 @@ def truth_of(record: Record) -> pd.DataFrame:
     )
 
 
-def known_minutes(record: Record) -> np.ndarray:
-    """Minutes in which the place of every ship is known, s since 1970; with absence unknown, those with a ship."""
-    known = (np.isfinite(record.range_m) & record.known) | (np.isnan(record.range_m) & record.known)
-    complete = known.all(axis=1)
+def known_minutes(record: Record, farthest_m: float = np.inf) -> np.ndarray:
+    """Minutes in which the place of every ship is known, s since 1970; with absence unknown, those with a ship within `farthest_m`."""
+    complete = record.known.all(axis=1)
     if not record.absence_known:
-        complete &= (np.isfinite(record.range_m) & record.known).any(axis=1)
+        complete &= (record.known & (record.range_m <= farthest_m)).any(axis=1)
     return record.minute[complete]

@@ -6,7 +6,8 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,7 +22,7 @@ from torch.utils.data import DataLoader, Dataset
 from obsnet.config import first_change
 from obsnet.errors import ConfigError, ModelError
 from obsnet.learn.dataset import digest
-from obsnet.output import prepare_folder
+from obsnet.output import locked, prepare_folder
 
 Batch = dict[str, Tensor]
 
@@ -146,7 +147,7 @@ def fit(
     Raises
     ------
     ConfigError : the folder holds another training, with other data, settings, first weights or trainer (it may be given more
-        minutes); or the time was too short for an epoch.
+        minutes); or one is under way in it; or the time was too short for an epoch.
     """
     folder = prepare_folder(folder)
     last = folder / "last.ckpt"
@@ -168,7 +169,7 @@ def fit(
         callbacks=[best, EarlyStopping("validation_loss", patience=config.patience)],
         num_sanity_val_steps=0,
     )  # fmt: skip
-    with warnings.catch_warnings():
+    with _alone(folder), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
     if not best.best_model_path:
@@ -177,6 +178,20 @@ def fit(
     task.load_state_dict(state)
     assert best.best_model_score is not None
     return float(best.best_model_score)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Raise `ConfigError` where a training is under way in a folder."""
+    with ExitStack() as held:
+        try:
+            if os.name == "posix":
+                held.enter_context(locked(folder, alone=True))
+        except OSError:
+            raise ConfigError(
+                f"another training is under way in {folder}; name another folder, or one with ${{trainer.seed}} in it for several seeds"
+            ) from None
+        yield
 
 
 def _told(network: nn.Module, config: TrainerConfig, settings: dict[str, Any]) -> str:

@@ -231,6 +231,7 @@ def test_a_model_that_was_exchanged_is_refused(sds, record, tmp_path, config):
         (("--start", "2013-05-21T01:00:00"), "not a midnight"),
         (("--start", "yesterday"), "is no date"),
         (("--end", "2013-05-21"), "is not before the end"),
+        (("--end", "2999-01-01"), "lies ahead"),
         (("--select", "YV.*"), "describes none of YV.*"),
         (("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler answers at tcp://127.0.0.1:1"),
         (("--set", "tracker=bernoulli"), "grid search"),

@@ -153,6 +153,10 @@ def test_records_give_back_what_was_heard_and_known(prepared):
     assert len(truth_of(part)) == 30
     silent = Record(held.attributes | {"absence_known": False}, prepared.read("r1").arrays)
     assert len(known_minutes(silent)) == 0
+    seen = Record(held.attributes | {"absence_known": False}, held.arrays)
+    near = (held.range_m <= 19e3).any(axis=1)
+    assert 0 < near.sum() < len(near)
+    np.testing.assert_array_equal(known_minutes(seen, 19e3), held.minute[near])
 
 
 def test_hydrophone_records_are_prepared_once(tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ from obsnet.learn.dataset import PreparedSet, Record  # noqa: E402
 from obsnet.learn.export import export, parity  # noqa: E402
 from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
 from obsnet.learn.task import TrainerConfig, load_weights  # noqa: E402
+from obsnet.output import locked  # noqa: E402
 from obsnet.signals.spectra import SpectraConfig  # noqa: E402
 
 NETWORK = AzimuthNetworkConfig(hidden=4, gates=2, harmonics=6, azimuths=24, width=4, kernel=3)
@@ -123,6 +124,13 @@ def test_a_folder_belongs_to_one_training(run, prepared, tmp_path):
     with pytest.raises(ConfigError, match="name another folder"):
         training.finetune(prepared, run, run / "weights.pt", trainer=TRAINER, say=lambda text: None)
     assert (run / "weights.pt").read_bytes() == before
+
+
+def test_one_training_at_a_time_in_a_folder(prepared, tmp_path):
+    """Two seeds of a sweep that are given one folder would write into each other's weights."""
+    with locked(tmp_path, alone=True), pytest.raises(ConfigError, match="another training is under way"):
+        training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
+    assert not (tmp_path / "weights.pt").exists()
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path):
