@@ -180,10 +180,8 @@ def train(
         made, _, features, earlier = restored(begin_with)
         task = replace(task, features=features)
         if not trainer.epochs:
-            about = {
-                "trained": {key: earlier.get(key) for key in ("trainer", "examples", "made")},
-                **(about or {}),
-            }
+            trained = {key: earlier.get(key) for key in ("trainer", "examples", "made")}
+            about = {"trained": earlier.get("trained", trained), **(about or {})}
             found = {"validation_loss": float(earlier["metrics"]["validation_loss"])}
             share = float(earlier.get("ship_share", SHIP_SHARE))
             return finish(made, sets, folder, task, trainer, found, about, say, share)

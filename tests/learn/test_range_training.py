@@ -103,6 +103,9 @@ def test_trained_weights_are_calibrated_anew_for_another_look_and_stay_as_they_a
     assert (calibration.peaks, calibration.rates, calibration.least) == (3, 3, 4.0)
     assert about["trained"]["trainer"]["epochs"] == 2
     assert found["validation_loss"] == trained[1]["validation_loss"]
+    first = tmp_path / "new" / "weights.pt"
+    train([prepared], tmp_path / "newer", task=TASK, trainer=none, say=lambda text: None, begin_with=first)
+    assert restored(tmp_path / "newer" / "weights.pt")[3]["trained"] == about["trained"]
 
 
 def test_a_folder_belongs_to_one_training(trained, prepared):
