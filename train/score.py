@@ -25,8 +25,8 @@ from obsnet.run import Run
 
 EXPECTED_CPA_M = 25e3
 """Ships that come no closer need not be found; a track of one is not false."""
-WITHIN_90 = 1.645
-"""Standard deviations of a normal error's 90 % region."""
+REGIONS = {50: 0.6745, 90: 1.645}
+"""Standard deviations of a normal error's central regions, by per cent."""
 
 
 def ships(run: Run, folder: Path) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def ships(run: Run, folder: Path) -> dict[str, Any]:
     station = run.station
     where = (station.latitude, station.longitude)
     if pd.read_csv(folder / "ais.csv").empty:
-        return {"found": 0, "missed": 0, "false": len(run.tracks), "errors": [], "within": []}
+        return {"found": 0, "missed": 0, "false": len(run.tracks), "errors": []}
     about = reference_tracks(read(folder / "ais.csv", near=where), where, max_cpa_m=None)
     said = evaluate(run.detections, run.tracks, about, run.delay, expected_cpa_m=EXPECTED_CPA_M)
     found = [ship for ship in said.ships if ship.number and ship.track is not None]
@@ -42,13 +42,12 @@ def ships(run: Run, folder: Path) -> dict[str, Any]:
         (s.cpa_time_error_s, s.cpa_distance_error_m, s.course_error_deg, s.speed_error_mps) for s in found
     ]
     spread = [run.tracks[ship.track - 1].std for ship in found if ship.track is not None]
-    within = [np.abs(error) <= WITHIN_90 * std for error, std in zip(errors, spread, strict=True)]
     return {
         "found": len(found),
         "missed": len(said.missed),
         "false": len(said.false_tracks),
-        "errors": errors,
-        "within": within,
+        "errors": np.abs(errors),
+        "of_spread": np.abs(errors) / np.array(spread),
     }
 
 
@@ -100,16 +99,14 @@ def main() -> None:
         f"{len(scores)} simulated records: " + ", ".join(f"{count} {name}" for name, count in total.items())
     )
     if total["found"]:
-        errors = np.median(
-            np.abs(np.concatenate([score["errors"] for score in scores if score["errors"]])), axis=0
-        )
-        within = 100 * np.mean(
-            np.concatenate([score["within"] for score in scores if score["within"]]), axis=0
-        )
+        told = [score for score in scores if len(score["errors"])]
+        errors = np.median(np.concatenate([score["errors"] for score in told]), axis=0)
         print("medians of the errors: {:.1f} s, {:.0f} m, {:.2f}°, {:.2f} m/s".format(*errors))
-        print(
-            f"90 % regions hold CPA time, distance, course, speed in {', '.join(f'{share:.0f}' for share in within)} %"
-        )
+        for share, reach in REGIONS.items():
+            within = 100 * (np.concatenate([score["of_spread"] for score in told]) <= reach).mean(axis=0)
+            print(
+                f"{share} % regions hold CPA time, distance, course, speed in {', '.join(f'{x:.0f}' for x in within)} %"
+            )
     if tables:
         print(f"azimuth {in_words(pd.concat(tables), given.above)}")
 
