@@ -69,7 +69,7 @@ def staged(folder: str | Path, leftovers: tuple[str, ...] = ()) -> Iterator[Path
 
 @contextmanager
 def locked(folder: Path, alone: bool = False) -> Iterator[None]:
-    """Hold a lock on a folder, as long as the process lives; `OSError` where it is to be held `alone` and another holds it."""
+    """Hold a lock on a folder, which a killed process lets go of too; `OSError` where it is to be held `alone` and another holds it."""
     if os.name != "posix":
         if alone:
             raise OSError("folders cannot be locked here: what a killed run left stays")

@@ -85,3 +85,17 @@ def finished(record, tmp_path_factory):
     assert left.value.code == 0
     yield out
     shutil.rmtree(out)
+
+
+@pytest.fixture(scope="session")
+def alive():
+    """Whether a process of that number runs; one that nobody waited for does not."""
+
+    def runs(process):
+        try:
+            with open(f"/proc/{process}/stat", encoding="ascii") as file:
+                return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+        except FileNotFoundError:
+            return False
+
+    return runs

@@ -154,7 +154,7 @@ crew.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
-def test_copies_end_with_a_process_that_is_killed():
+def test_copies_end_with_a_process_that_is_killed(alive):
     made = subprocess.Popen(
         [sys.executable, "-c", ALONE + "crew = Crew(task, 2)\ncrew.submit('sleep')\ntime.sleep(60)"],
         stdout=subprocess.PIPE, text=True,
@@ -261,14 +261,6 @@ for copy in multiprocessing.active_children():
 """)
     assert made.returncode == 0, made.stderr
     assert made.stdout == ""
-
-
-def alive(process):
-    try:
-        with open(f"/proc/{process}/stat", encoding="ascii") as file:
-            return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
-    except FileNotFoundError:
-        return False
 
 
 @pytest.mark.parametrize("asked", [0, -2, 1.5, True, "2"])

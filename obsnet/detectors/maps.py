@@ -118,20 +118,15 @@ def coverage(valid: np.ndarray, frame_time: np.ndarray, minutes: np.ndarray, win
     frame_time : s since 1970; frames lie on multiples of the hop plus a constant, those without data may be left out.
     minutes : s since 1970. window_s : s; windows as of `window_bounds`.
     """
+    if not len(frame_time):
+        return np.zeros(len(minutes), np.float32)
     start, stop = window_bounds(frame_time, minutes, window_s)
     total = np.concatenate([[0], np.cumsum(valid)])
-    found = total[stop] - total[start]
     # In whole microseconds, so that frames on a window's edge count alike wherever the record begins.
-    step = round(1e6 * hop(frame_time))
-    first = _microseconds(frame_time[:1]).sum()
-    low, high = (
-        -((first + 1 - _microseconds(minutes + side * window_s / 2)) // step) for side in (-1.0, 1.0)
-    )
-    return np.minimum(found / np.maximum(high - low, 1), 1.0).astype(np.float32)
-
-
-def _microseconds(time: np.ndarray) -> np.ndarray:
-    return np.rint(1e6 * np.asarray(time, float)).astype(np.int64)
+    step, edges = round(1e6 * hop(frame_time)), np.array([-0.5, 0.5])[:, None] * window_s
+    beyond = np.rint(1e6 * (minutes + edges)).astype(np.int64) - round(1e6 * float(frame_time[0])) - 1
+    low, high = -(-beyond // step)
+    return np.minimum((total[stop] - total[start]) / np.maximum(high - low, 1), 1.0).astype(np.float32)
 
 
 def log_mean_exp(

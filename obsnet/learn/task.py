@@ -150,6 +150,19 @@ def fit(
         minutes); or one is under way in it; or the time was too short for an epoch.
     """
     folder = prepare_folder(folder)
+    with _alone(folder):
+        return _fit(problem, train, validation, folder, config, settings, progress)
+
+
+def _fit(
+    problem: Problem,
+    train: Dataset,
+    validation: Dataset,
+    folder: Path,
+    config: TrainerConfig,
+    settings: dict[str, Any],
+    progress: bool,
+) -> float:
     last = folder / "last.ckpt"
     told = _told(problem.network, config, settings)
     if last.is_file():
@@ -169,7 +182,7 @@ def fit(
         callbacks=[best, EarlyStopping("validation_loss", patience=config.patience)],
         num_sanity_val_steps=0,
     )  # fmt: skip
-    with _alone(folder), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
     if not best.best_model_path:

@@ -58,7 +58,7 @@ def wait_for(wish, seconds=30.0):
         time.sleep(0.05)
 
 
-def test_runs_end_with_the_process_that_wants_them(tmp_path):
+def test_runs_end_with_the_process_that_wants_them(tmp_path, alive):
     wanting = multiprocessing.get_context("spawn").Process(
         target=montecarlo.run, args=(say_and_wait, 2, 0, 2, None, (tmp_path,))
     )
@@ -66,16 +66,7 @@ def test_runs_end_with_the_process_that_wants_them(tmp_path):
     wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
     wanting.kill()
     wanting.join()
-    wait_for(lambda: not any(is_alive(int(path.name)) for path in tmp_path.iterdir()))
-
-
-def is_alive(number):
-    try:
-        os.kill(number, 0)
-    except ProcessLookupError:
-        return False
-    with open(f"/proc/{number}/stat") as file:
-        return file.read().rpartition(")")[2].split()[0] != "Z"
+    wait_for(lambda: not any(alive(int(path.name)) for path in tmp_path.iterdir()))
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
