@@ -19,6 +19,7 @@ from obsnet.learn.dataset import JoinedSets, PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters
 from obsnet.learn.prepare import provenance
 from obsnet.learn.task import TrainerConfig, fit, load_weights, save_weights, seeded
+from obsnet.output import prepare_folder
 
 WEIGHTS = "weights.pt"
 
@@ -52,8 +53,15 @@ def train(
     Parameters
     ----------
     folder : of the run. about : anything to keep with the weights, for instance the composed configuration.
-    begin_with : weights of an earlier run to begin with, whose network is then taken.
+    begin_with : weights of an earlier run to begin with, whose network is then taken; with no epochs they are calibrated and
+        measured anew, at the odds of a ship that they were trained at, and training records are not needed.
     """
+    if begin_with and not trainer.epochs:
+        made, before, earlier = restored(begin_with)
+        trained = {key: earlier.get(key) for key in ("trainer", "labels", "made", "data_digest")}
+        about = {"trained": earlier.get("trained", trained), **(about or {})}
+        labels = replace(labels, prior_odds=before.prior_odds)
+        return finish(made, prepared, folder, labels, trainer, about, say)
     rows = AzimuthRows(prepared, "train", labels)
     check = AzimuthRows(prepared, "validation", labels)
     labels = replace(labels, prior_odds=prior_odds(rows))
@@ -174,7 +182,7 @@ def finish(
         "made": provenance(trainer),
         **(about or {}),
     }
-    save_weights(Path(folder) / WEIGHTS, network, description)
+    save_weights(prepare_folder(folder) / WEIGHTS, network, description)
     for name, value in found.items():
         say(f"{name} {value:.4g}")
     return found

@@ -96,7 +96,8 @@ def azimuth_card(network: AzimuthNetwork, calibration: Calibration, about: dict[
 def origin(network: Any, about: dict[str, Any]) -> dict[str, Any]:
     """What a card says of how a network of either kind came to be.
 
-    Of adapted weights metrics, digest and commit are those of the adaptation; what the network was before stands in ``about``.
+    Of adapted weights, and of weights calibrated anew, metrics, digest and commit are those of that; what the network was
+    before, or was trained with, stands in ``about``.
     """
     first = {
         "metrics": about["metrics"],
@@ -109,6 +110,8 @@ def origin(network: Any, about: dict[str, Any]) -> dict[str, Any]:
         "versions": about["made"]["versions"],
         "trained_on": "simulated records of obsnet's twin",
     }
+    if trained := about.get("trained"):
+        told["trained"] = {"data_digest": trained.get("data_digest"), "commit": trained["made"]["commit"]}
     tuned = about.get("finetune", {})
     if not tuned.get("adapted"):
         return first | {"about": told}

@@ -180,7 +180,7 @@ def train(
         made, _, features, earlier = restored(begin_with)
         task = replace(task, features=features)
         if not trainer.epochs:
-            trained = {key: earlier.get(key) for key in ("trainer", "examples", "made")}
+            trained = {key: earlier.get(key) for key in ("trainer", "examples", "made", "data_digest")}
             about = {"trained": earlier.get("trained", trained), **(about or {})}
             found = {"validation_loss": float(earlier["metrics"]["validation_loss"])}
             share = float(earlier.get("ship_share", SHIP_SHARE))

@@ -186,7 +186,7 @@ def _fit(
         warnings.simplefilter("ignore")
         trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
     if not best.best_model_path:
-        raise ConfigError("training ended before the first epoch; give it more minutes")
+        raise ConfigError("training ended before the first epoch; give it epochs, and more minutes")
     state = torch.load(best.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
     task.load_state_dict(state)
     assert best.best_model_score is not None

@@ -88,6 +88,29 @@ def test_weights_say_where_they_come_from(run, prepared):
     assert (run / "log" / "version_0" / "metrics.csv").read_text().count("\n") >= 3
 
 
+def test_trained_weights_are_calibrated_anew_and_stay_as_they_are(run, prepared, tmp_path):
+    other = PreparedSet(tmp_path / "other")
+    for split, number in (("validation", 8), ("test", 2)):
+        for i in range(number):
+            other.write(made_record(f"{split}-{i}", split, i % 4 == 0, 9000 + 100 * number + i))
+    none, labels, silent = replace(TRAINER, epochs=0), AzimuthTaskConfig(), lambda text: None
+    first = run / "weights.pt"
+    training.train(other, tmp_path / "new", NETWORK, labels, none, say=silent, begin_with=first)
+    (state, before), (after, about) = load_weights(first), load_weights(tmp_path / "new" / "weights.pt")
+    assert all(torch.equal(state[name], after[name]) for name in state)
+    assert about["calibration"]["highest"] > before["calibration"]["highest"]  # more windows to tell from
+    assert about["calibration"]["prior_odds"] == before["calibration"]["prior_odds"]
+    assert about["metrics"]["validation_minutes_without"] == 3 * about["metrics"]["validation_minutes_with"]
+    assert about["trained"]["data_digest"] == before["data_digest"] != about["data_digest"] == other.digest()
+    again = tmp_path / "new" / "weights.pt"
+    training.train(prepared, tmp_path / "newer", NETWORK, labels, none, say=silent, begin_with=again)
+    assert load_weights(tmp_path / "newer" / "weights.pt")[1]["trained"] == about["trained"]
+    card = ModelFile.read(export(again, tmp_path / "azimuth.onnx"), "azimuth").card
+    assert (
+        card.about["trained"]["data_digest"] == before["data_digest"] and card.data_digest == other.digest()
+    )
+
+
 def test_the_same_seed_gives_the_same_weights(run, prepared, tmp_path):
     training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
     first, again = (load_weights(folder / "weights.pt")[0] for folder in (run, tmp_path))
