@@ -58,7 +58,7 @@ def _changes(kind: str, seed: int, scenario: Scenario, rng: np.random.Generator)
     if kind == "faint":
         return {
             "passages": tuple(
-                replace(p, ship=Ship.random(seed, p.ship.mmsi, source_level_db=181.0))
+                replace(p, ship=Ship.random(p.ship.seed, p.ship.mmsi, source_level_db=181.0))
                 for p in scenario.passages
             )
         }

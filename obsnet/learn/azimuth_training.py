@@ -57,11 +57,11 @@ def train(
         measured anew, at the odds of a ship that they were trained at, and training records are not needed.
     """
     if begin_with and not trainer.epochs:
-        made, before, earlier = restored(begin_with)
+        old, before, earlier = restored(begin_with)
         trained = {key: earlier.get(key) for key in ("trainer", "labels", "made", "data_digest")}
         about = {"trained": earlier.get("trained", trained), **(about or {})}
         labels = replace(labels, prior_odds=before.prior_odds)
-        return finish(made, prepared, folder, labels, trainer, about, say)
+        return finish(old, prepared, folder, labels, trainer, about, say)
     rows = AzimuthRows(prepared, "train", labels)
     check = AzimuthRows(prepared, "validation", labels)
     labels = replace(labels, prior_odds=prior_odds(rows))

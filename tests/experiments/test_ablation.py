@@ -152,6 +152,13 @@ def test_the_twin_makes_every_kind(kind):
     assert twin_scenario(kind, 2, 3.0).seed != scenario.seed
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_ship_sounds_as_one_of_a_training_record_does(kind):
+    seeds = {p.ship.seed for number in (0, 1, 1000) for p in twin_scenario(kind, number, 3.0).passages}
+    assert all(seed >= 1000 * 100_000 for seed in seeds)  # training's are 1000 times a record's seed and a few
+    assert len(seeds) == {"no_ship": 0, "two_ships": 6}.get(kind, 3)
+
+
 def test_an_unknown_kind_is_refused():
     with pytest.raises(ConfigError, match="no kind of record 'odd'"):
         twin_scenario("odd", 0, 1.0)
