@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from obsnet.detectors.azimuth_features import CHANNELS, cell_index
+from obsnet.detectors.azimuth_features import BIN_S, CHANNELS, cell_index
+from obsnet.detectors.learned import WINDOW_S
 from obsnet.errors import ConfigError
 from obsnet.learn.dataset import NO_PHASOR, JoinedSets, PreparedSet, Record
 
@@ -31,6 +32,7 @@ class AzimuthTaskConfig:
     forget_share : share of rows whose slow memory (level, background) is taken away, as after a station's start.
     fade_share : share of rows whose lines and transients are weakened or strengthened: how much a ship's spectrum stands out and
         flickers is the simulator's habit, which the network shall not lean on.
+    unseen : chance that a sea of which absence is not known holds a vessel, in a minute with a ship, that AIS does not show.
     """
 
     reach_m: float = 60e3
@@ -38,14 +40,19 @@ class AzimuthTaskConfig:
     prior_odds: float = 1.0
     forget_share: float = 0.15
     fade_share: float = 0.5
+    unseen: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.unseen < 1.0:
+            raise ConfigError(f"unseen, a chance, lies between 0 and 1, not at {self.unseen:g}")
 
 
 class AzimuthRows(Dataset):
     """Rows of ten minutes of prepared records, in memory.
 
     A row holds invariants (cell, channel, frequency), phasor (2, cell, frequency), doubled (), turn (minute, ship) in parts
-    of the circle (of the doubled one where `doubled`), state (minute, ship) of `ABSENT`, `HERE`, `UNKNOWN`, and weight
-    (minute), 0 where a minute says nothing.
+    of the circle (of the doubled one where `doubled`), state (minute, ship) of `ABSENT`, `HERE`, `UNKNOWN`, weight
+    (minute), 0 where a minute says nothing, and watched (), 1 where no vessel is about that AIS does not show.
     """
 
     def __init__(
@@ -79,7 +86,7 @@ class AzimuthRows(Dataset):
         number, row = self.rows[item]
         record = self._records[number]
         minutes = slice(ROW_MINUTES * row, ROW_MINUTES * (row + 1))
-        first = int(cell_index(record.minute[minutes.start] - 90.0))
+        first = int(cell_index(record.minute[minutes.start] - WINDOW_S / 2))
         low = first - int(record.cell_index[0])
         inside = slice(max(low, 0), max(low + ROW_CELLS, 0))
         angle, invariants = record.phasor[inside], record.invariants[inside]
@@ -94,6 +101,7 @@ class AzimuthRows(Dataset):
             "turn": torch.from_numpy(turn),
             "state": torch.from_numpy(state),
             "weight": torch.from_numpy(weight),
+            "watched": torch.tensor(float(record.absence_known)),
         }
 
     def seen(self, item: int) -> tuple[np.ndarray, np.ndarray]:
@@ -118,11 +126,19 @@ def _labels(
     state = np.where(placed & (state != HERE), UNKNOWN, state)
     lost = (~known & ~placed).any(axis=1)
     here = (state == HERE).any(axis=1)
-    weight = (~lost & (here | record.absence_known)).astype(np.float32)
+    weight = (_heard(record) & ~lost & (here | record.absence_known)).astype(np.float32)
     fold = 360.0 / float(record.attributes["ambiguity_deg"])
     turn = np.nan_to_num(azimuth * fold / 360.0).astype(np.float32) % 1.0
     missing = ((0, 0), (0, ships - turn.shape[1]))
     return np.pad(turn, missing), np.pad(state, missing).astype(np.int64), weight
+
+
+def _heard(record: Record) -> np.ndarray:
+    """Whether anything was recorded in each minute's window."""
+    before = np.concatenate([[0], np.cumsum((record.phasor != NO_PHASOR).any(axis=1))])
+    first = cell_index(record.minute - WINDOW_S / 2) - int(record.cell_index[0])
+    begin, end = (np.clip(cells, 0, len(before) - 1) for cells in (first, first + round(WINDOW_S / BIN_S)))
+    return before[end] > before[begin]
 
 
 def augmented(batch: Batch, generator: torch.Generator, config: AzimuthTaskConfig) -> Batch:
@@ -163,8 +179,9 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     With a ship at θ: −log(π(θ) e^{l(θ)} / (1 + Σ π e^l)), with none: −log(1 / (1 + Σ π e^l)), π the prior of an azimuth over
     that of no ship. Where several ships are there each is asked for alone, without the sectors of the others. Beside ships, too,
     it is asked whether the rest of the circle is empty: else a loud ship, which no minute without one resembles, would lift the
-    ratio everywhere. The sectors of ships beyond reach say nothing. At its minimum l is the log-likelihood ratio, the prior of
-    the training draws removed.
+    ratio everywhere. The sectors of ships beyond reach say nothing. Where absence is not known both losses are those of a
+    mixture: by the chance `unseen` another vessel is about, and a loud one in the rest of the circle costs no more than that
+    chance is small. At its minimum l is the log-likelihood ratio, the prior of the training draws removed.
     """
     count = ratio.shape[-1]
     log_prior = float(np.log(config.prior_odds / count))
@@ -187,10 +204,21 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     evidence = torch.nn.functional.softplus(_logsumexp(scores[:, :, None].masked_fill(closed, -torch.inf)))
     taken = silent | (beside & here[..., None]).any(2)
     nothing = torch.nn.functional.softplus(_logsumexp(scores.masked_fill(taken, -torch.inf)))
-    asked = evidence - at_turn(scores, batch["turn"])
+    there = at_turn(scores, batch["turn"])
+    asked = evidence - there
+    watched = batch["watched"][:, None] > 0
+    alone = torch.nn.functional.softplus(-there)
+    asked = torch.where(watched[..., None], asked, _either(asked, alone, config.unseen))
+    somewhere = -torch.log(-torch.expm1(-nothing.clamp(min=1e-6)))
+    nothing = torch.where(watched, nothing, _either(nothing, somewhere, config.unseen))
     number = here.sum(2)
     with_ship = (asked * here).sum(2) / number.clamp(min=1)
     return with_ship + nothing
+
+
+def _either(likely: Tensor, other: Tensor, chance: float) -> Tensor:
+    """Negative log probability of a mixture of two, given theirs, and the chance of the other."""
+    return -torch.logaddexp(np.log1p(-chance) - likely, np.log(chance) - other)
 
 
 def _logsumexp(values: Tensor) -> Tensor:

@@ -56,7 +56,7 @@ def outputs(network: AzimuthNetwork, rows: AzimuthRows, batch: int = 16) -> Outp
     with torch.no_grad():
         for item in DataLoader(rows, batch):
             ratios.append(network(item["invariants"], item["phasor"], item["doubled"]))
-            labels.append({name: item[name] for name in ("doubled", "turn", "state", "weight")})
+            labels.append({name: item[name] for name in ("doubled", "turn", "state", "weight", "watched")})
     joined = {name: torch.cat([item[name] for item in labels]) for name in labels[0]}
     return Outputs(torch.cat(ratios), joined, np.array([number for number, _ in rows.rows]))
 

@@ -5,6 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from obsnet.errors import ConfigError  # noqa: E402
 from obsnet.learn.azimuth import (  # noqa: E402
     ABSENT,
     HERE,
@@ -39,12 +40,13 @@ def network(config=SMALL):
     return AzimuthNetwork(config).eval()
 
 
-def labels(turn, state, rows=1, minutes=1):
+def labels(turn, state, rows=1, minutes=1, watched=1.0):
     return {
         "turn": torch.tensor(turn, dtype=torch.float32).reshape(rows, minutes, -1),
         "state": torch.tensor(state).reshape(rows, minutes, -1),
         "doubled": torch.zeros(rows),
         "weight": torch.ones(rows, minutes),
+        "watched": torch.full((rows,), watched),
     }
 
 
@@ -132,6 +134,29 @@ def test_a_loud_ship_does_not_lift_the_rest_of_the_circle():
     assert float(minute_losses(lifted, batch, config)) > 2 + float(minute_losses(ratio, batch, config))
 
 
+def test_a_vessel_that_ais_does_not_show_costs_little_where_absence_is_not_known():
+    config, ais = AzimuthTaskConfig(unseen=0.1), labels([0.25], [HERE], watched=0.0)
+    ratio = torch.full((1, 1, 60), -5.0)
+    ratio[0, 0, 15] = 10.0
+    both, loud, lifted = ratio.clone(), ratio.clone(), ratio.clone()
+    both[0, 0, 45], loud[0, 0, 45] = 10.0, 20.0
+    lifted[0, 0, 30:] = 3.0
+    cost = [float(minute_losses(values, ais, config)) for values in (ratio, both, loud, lifted)]
+    assert cost[0] < 0.3 and cost[0] + 1.0 < cost[1] < cost[2] < 2 * np.log(10.0) + 0.2
+    assert cost[3] > cost[0] + 1.0  # a loud ship still lifts nothing
+    sure = float(minute_losses(loud, labels([0.25], [HERE]), config))
+    assert sure > 20.0
+    faint = ratio.clone()
+    faint[0, 0, 15] = 0.0
+    assert float(minute_losses(faint, ais, config)) > cost[0] + 2.0
+
+
+@pytest.mark.parametrize("unseen", [0.0, 1.0, float("nan")])
+def test_a_chance_lies_between_never_and_always(unseen):
+    with pytest.raises(ConfigError, match="unseen"):
+        AzimuthTaskConfig(unseen=unseen)
+
+
 def test_two_ships_are_two_peaks():
     config = AzimuthTaskConfig()
     batch = labels([0.25, 0.75], [HERE, HERE])
@@ -197,6 +222,7 @@ def test_exact_ratios_are_calibrated_however_many_ships_a_set_holds(share):
         "state": state,
         "turn": torch.zeros(40, 500, 1),
         "weight": torch.ones(40, 500),
+        "watched": torch.ones(40),
         "doubled": torch.zeros(40),
     }
     said = Outputs(exact[..., None].expand(40, 500, 24), batch, np.arange(40))

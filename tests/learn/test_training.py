@@ -14,7 +14,7 @@ from obsnet.errors import ConfigError, ModelError  # noqa: E402
 from obsnet.learn import azimuth_training as training  # noqa: E402
 from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig  # noqa: E402
 from obsnet.learn.calibration import bounded  # noqa: E402
-from obsnet.learn.dataset import PreparedSet, Record  # noqa: E402
+from obsnet.learn.dataset import NO_PHASOR, PreparedSet, Record  # noqa: E402
 from obsnet.learn.export import export, parity  # noqa: E402
 from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
 from obsnet.learn.task import TrainerConfig, load_weights  # noqa: E402
@@ -307,6 +307,21 @@ def test_the_card_of_an_adapted_model_tells_of_the_adaptation(run, prepared, tmp
         else:
             assert card.data_digest == prepared.digest() and card.metrics == about["metrics"]
             assert "own passages" not in card.about["trained_on"]
+
+
+def test_minutes_without_data_say_nothing(tmp_path):
+    record = made_record("gap", "train", True, 7)
+    begin = record.arrays["cell_index"][0]
+    lost = slice(30, 60)  # ten minutes from 500 or so seconds on
+    record.arrays["phasor"][lost] = NO_PHASOR
+    made = PreparedSet(tmp_path)
+    made.write(record)
+    rows = AzimuthRows(made, "train")
+    weight = np.concatenate([rows.seen(item)[1] for item in range(len(rows))])
+    minute, gap = record.arrays["minute"], 20.0 * (begin + np.array([lost.start, lost.stop])) + 10.0
+    inside = (minute - 90.0 >= gap[0]) & (minute + 90.0 <= gap[1])
+    assert inside.sum() == 7
+    np.testing.assert_array_equal(weight == 0.0, inside)
 
 
 def test_passages_of_which_nothing_is_known_adapt_nothing(run, tmp_path):
