@@ -147,8 +147,10 @@ def fit(
     Raises
     ------
     ConfigError : the folder holds another training, with other data, settings, first weights or trainer (it may be given more
-        minutes); or one is under way in it; or the time was too short for an epoch.
+        minutes); or one is under way in it; or there are no epochs, or the time was too short for one.
     """
+    if config.epochs < 1:
+        raise ConfigError(f"{config.epochs} epochs (trainer.epochs) train nothing; give it 1 at least")
     folder = prepare_folder(folder)
     with _alone(folder):
         return _fit(problem, train, validation, folder, config, settings, progress)
@@ -186,7 +188,7 @@ def _fit(
         warnings.simplefilter("ignore")
         trainer.fit(task, loader, check, ckpt_path=last if last.is_file() else None, weights_only=True)
     if not best.best_model_path:
-        raise ConfigError("training ended before the first epoch; give it epochs, and more minutes")
+        raise ConfigError("training ended before the first epoch; give it more minutes")
     state = torch.load(best.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
     task.load_state_dict(state)
     assert best.best_model_score is not None

@@ -111,6 +111,15 @@ def test_trained_weights_are_calibrated_anew_and_stay_as_they_are(run, prepared,
     )
 
 
+def test_no_epochs_train_nothing(run, prepared, tmp_path):
+    none, silent = replace(TRAINER, epochs=0), lambda text: None
+    with pytest.raises(ConfigError, match=r"trainer\.epochs"):
+        training.train(prepared, tmp_path / "new", NETWORK, AzimuthTaskConfig(), none, say=silent)
+    with pytest.raises(ConfigError, match=r"trainer\.epochs"):
+        training.finetune(prepared, tmp_path / "new", run / "weights.pt", trainer=none, say=silent)
+    assert not (tmp_path / "new").exists()
+
+
 def test_the_same_seed_gives_the_same_weights(run, prepared, tmp_path):
     training.train(prepared, tmp_path, NETWORK, AzimuthTaskConfig(), TRAINER, say=lambda text: None)
     first, again = (load_weights(folder / "weights.pt")[0] for folder in (run, tmp_path))
