@@ -32,7 +32,7 @@ class AzimuthTaskConfig:
     forget_share : share of rows whose slow memory (level, background) is taken away, as after a station's start.
     fade_share : share of rows whose lines and transients are weakened or strengthened: how much a ship's spectrum stands out and
         flickers is the simulator's habit, which the network shall not lean on.
-    unseen : chance that a sea of which absence is not known holds a vessel, in a minute with a ship, that AIS does not show.
+    unseen : share of minutes in which, where absence is not known, something else is heard than the ship that AIS shows.
     """
 
     reach_m: float = 60e3
@@ -44,7 +44,7 @@ class AzimuthTaskConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.unseen < 1.0:
-            raise ConfigError(f"unseen, a chance, lies between 0 and 1, not at {self.unseen:g}")
+            raise ConfigError(f"unseen, a share, lies between 0 and 1, not at {self.unseen:g}")
 
 
 class AzimuthRows(Dataset):
@@ -179,9 +179,12 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     With a ship at θ: −log(π(θ) e^{l(θ)} / (1 + Σ π e^l)), with none: −log(1 / (1 + Σ π e^l)), π the prior of an azimuth over
     that of no ship. Where several ships are there each is asked for alone, without the sectors of the others. Beside ships, too,
     it is asked whether the rest of the circle is empty: else a loud ship, which no minute without one resembles, would lift the
-    ratio everywhere. The sectors of ships beyond reach say nothing. Where absence is not known both losses are those of a
-    mixture: by the chance `unseen` another vessel is about, and a loud one in the rest of the circle costs no more than that
-    chance is small. At its minimum l is the log-likelihood ratio, the prior of the training draws removed.
+    ratio everywhere. The sectors of ships beyond reach say nothing. At its minimum l is the log-likelihood ratio, the prior of
+    the training draws removed.
+
+    Where absence is not known, every minute that says something holds a ship, so that the ratio would rise without end, and
+    vessels may be about that AIS does not show. There it is asked where the ship is, not whether: −log((1 − ε) e^{l(θ)} / Σ e^l +
+    ε / number of azimuths), ε = `unseen`.
     """
     count = ratio.shape[-1]
     log_prior = float(np.log(config.prior_odds / count))
@@ -201,24 +204,23 @@ def minute_losses(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Ten
     )
     closed = (others | silent[:, :, None]) & ~own
     scores = ratio + log_prior
-    evidence = torch.nn.functional.softplus(_logsumexp(scores[:, :, None].masked_fill(closed, -torch.inf)))
+    every = _logsumexp(scores[:, :, None].masked_fill(closed, -torch.inf))
     taken = silent | (beside & here[..., None]).any(2)
     nothing = torch.nn.functional.softplus(_logsumexp(scores.masked_fill(taken, -torch.inf)))
     there = at_turn(scores, batch["turn"])
-    asked = evidence - there
+    elsewhere = ratio.new_tensor(np.log(config.unseen / count))
+    place = -torch.logaddexp(np.log1p(-config.unseen) + there - every, elsewhere)
     watched = batch["watched"][:, None] > 0
-    alone = torch.nn.functional.softplus(-there)
-    asked = torch.where(watched[..., None], asked, _either(asked, alone, config.unseen))
-    somewhere = -torch.log(-torch.expm1(-nothing.clamp(min=1e-6)))
-    nothing = torch.where(watched, nothing, _either(nothing, somewhere, config.unseen))
+    asked = torch.where(watched[..., None], torch.nn.functional.softplus(every) - there, place)
+    nothing = torch.where(watched, nothing, torch.zeros_like(nothing))
     number = here.sum(2)
     with_ship = (asked * here).sum(2) / number.clamp(min=1)
     return with_ship + nothing
 
 
-def _either(likely: Tensor, other: Tensor, chance: float) -> Tensor:
-    """Negative log probability of a mixture of two, given theirs, and the chance of the other."""
-    return -torch.logaddexp(np.log1p(-chance) - likely, np.log(chance) - other)
+def presence(ratio: Tensor) -> Tensor:
+    """Log marginal ratio of presence of ratios (row, minute, azimuth), every azimuth as likely: (row, minute)."""
+    return torch.logsumexp(ratio, -1) - float(np.log(ratio.shape[-1]))
 
 
 def _logsumexp(values: Tensor) -> Tensor:
@@ -235,7 +237,18 @@ def at_turn(values: Tensor, turn: Tensor) -> Tensor:
     return values.gather(2, first) * (1 - share) + values.gather(2, (first + 1) % count) * share
 
 
-def loss(ratio: Tensor, batch: Batch, config: AzimuthTaskConfig) -> Tensor:
-    """Mean over the minutes that say something."""
+def loss(
+    ratio: Tensor, batch: Batch, config: AzimuthTaskConfig, presence_before: Tensor | None = None
+) -> Tensor:
+    """Mean over the minutes that say something; where absence is not known, presence is held where it was before.
+
+    Parameters
+    ----------
+    presence_before : of `presence`, before an adaptation; its change costs its square, in minutes whatever is known of them.
+    """
     weight = batch["weight"]
-    return (minute_losses(ratio, batch, config) * weight).sum() / weight.sum().clamp(min=1.0)
+    value = (minute_losses(ratio, batch, config) * weight).sum() / weight.sum().clamp(min=1.0)
+    if presence_before is None:
+        return value
+    change = (presence(ratio) - presence_before) ** 2 * (1.0 - batch["watched"][:, None])
+    return value + change.mean()

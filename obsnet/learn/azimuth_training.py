@@ -13,7 +13,7 @@ from torch import Tensor
 from obsnet.config import build
 from obsnet.detectors.azimuth_features import FeatureConfig
 from obsnet.errors import ConfigError
-from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig, Batch, augmented, loss
+from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig, Batch, augmented, loss, presence
 from obsnet.learn.calibration import Calibration, apply, calibrate, metrics, outputs
 from obsnet.learn.dataset import JoinedSets, PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters
@@ -25,17 +25,24 @@ WEIGHTS = "weights.pt"
 
 
 class AzimuthProblem:
-    """The azimuth network with its loss."""
+    """The azimuth network with its loss; `before` is what it was before an adaptation."""
 
-    def __init__(self, network: AzimuthNetwork, config: AzimuthTaskConfig) -> None:
+    def __init__(
+        self, network: AzimuthNetwork, config: AzimuthTaskConfig, before: AzimuthNetwork | None = None
+    ) -> None:
         self.network: torch.nn.Module = network
-        self.config = config
+        self.config, self._before = config, before
 
     def loss(self, batch: Batch, training: bool, generator: torch.Generator) -> Tensor:
         """Mean loss of a batch, augmented in training."""
         batch = augmented(batch, generator, self.config) if training else batch
-        ratio = self.network(batch["invariants"], batch["phasor"], batch["doubled"])
-        return loss(ratio, batch, self.config)
+        inputs = batch["invariants"], batch["phasor"], batch["doubled"]
+        ratio = self.network(*inputs)
+        if self._before is None:
+            return loss(ratio, batch, self.config)
+        with torch.no_grad():
+            before = presence(self._before(*inputs))
+        return loss(ratio, batch, self.config, before)
 
 
 def train(
@@ -81,9 +88,10 @@ def _fit(
     folder: str | Path,
     labels: AzimuthTaskConfig,
     trainer: TrainerConfig,
+    before: AzimuthNetwork | None = None,
 ) -> None:
     settings = {"data": prepared.digest(), "labels": asdict(labels)}
-    fit(AzimuthProblem(network, labels), rows, check, folder, trainer, settings)
+    fit(AzimuthProblem(network, labels, before), rows, check, folder, trainer, settings)
 
 
 def finetune(
@@ -98,7 +106,8 @@ def finetune(
     """Adapt trained weights to a station; the old ones are kept where the new are not better on held-out passages.
 
     The held-out passages are the validation split's. The old calibration stays: what AIS does not show is unknown at a real
-    station, and a handful of passages says nothing of the sea without ships.
+    station, and a handful of passages says nothing of the sea without ships. So presence is held where it was, too, in every
+    minute of a set of which absence is not known: passages alone would teach that there always is a ship.
     """
     made, calibration, before = restored(weights)
     labels = replace(labels, prior_odds=calibration.prior_odds)
@@ -107,13 +116,13 @@ def finetune(
     for split, held in (("train", rows), ("validation", check)):
         if not any(held.seen(item)[1].any() for item in range(len(held))):
             raise ConfigError(f"no ship's place is known in any {split} record; prepare more days")
-    old = {name: values.clone() for name, values in made.state_dict().items()}
-    loss_before = held_out_loss(made, check, calibration, labels)
-    _fit(made, prepared, rows, check, folder, labels, trainer)
-    loss_after = held_out_loss(made, check, calibration, labels)
+    old = restored(weights)[0].eval()
+    loss_before = held_out_loss(made, check, calibration, labels, old)
+    _fit(made, prepared, rows, check, folder, labels, trainer, old)
+    loss_after = held_out_loss(made, check, calibration, labels, old)
     better = loss_after < loss_before
     if not better:
-        made.load_state_dict(old)
+        made.load_state_dict(old.state_dict())
     verdict = "kept the new weights" if better else "kept the old weights"
     say(f"held-out passages: {loss_before:.4f} nats a minute before, {loss_after:.4f} after; {verdict}")
     found = {"loss_before": loss_before, "loss_after": loss_after, "adapted": float(better)}
@@ -125,11 +134,15 @@ def finetune(
 
 
 def held_out_loss(
-    network: AzimuthNetwork, rows: AzimuthRows, calibration: Calibration, labels: AzimuthTaskConfig
+    network: AzimuthNetwork,
+    rows: AzimuthRows,
+    calibration: Calibration,
+    labels: AzimuthTaskConfig,
+    before: AzimuthNetwork,
 ) -> float:
-    """Loss per minute of calibrated ratios."""
-    said = outputs(network, rows)
-    return float(loss(apply(said, calibration), said.batch, labels))
+    """Loss per minute of calibrated ratios, the change of presence since `before` included."""
+    said, first = outputs(network, rows), outputs(before, rows)
+    return float(loss(apply(said, calibration), said.batch, labels, presence(apply(first, calibration))))
 
 
 def restored(path: str | Path) -> tuple[AzimuthNetwork, Calibration, dict[str, Any]]:

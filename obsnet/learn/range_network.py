@@ -103,3 +103,20 @@ def range_loss(ratio: Tensor, log_measure: Tensor, ship: Tensor, ship_share: flo
     total = torch.logsumexp(ratio[:, 1:] + log_measure, dim=1) + odds
     evidence = functional.softplus(total)
     return evidence - torch.where(ship, ratio[:, 0] + odds, torch.zeros_like(evidence))
+
+
+def place_loss(ratio: Tensor, log_measure: Tensor, before: Tensor) -> Tensor:
+    """Loss of windows that all hold a ship: where it is, not whether.
+
+    Parameters
+    ----------
+    ratio, before : (n, 1 + hypotheses) log likelihood ratios now and before the adaptation, the truth first.
+    log_measure : of `range_loss`.
+
+    Notes
+    -----
+    −log(e^{l(true)} / Σ_h prior_h e^{l(h)}), which no constant in l changes, and the square of the change of the log marginal
+    ratio of presence, log Σ_h prior_h e^{l(h)}: windows with ships alone would teach that there always is one.
+    """
+    total, first = (torch.logsumexp(said[:, 1:] + log_measure, dim=1) for said in (ratio, before))
+    return total - ratio[:, 0] + (total - first) ** 2

@@ -26,7 +26,7 @@ from obsnet.learn.networks import parameters
 from obsnet.learn.prepare import provenance
 from obsnet.learn.range_calibration import calibrate, hear, looked_at, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
-from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, range_loss
+from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, place_loss, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
 from obsnet.output import prepare_folder
 from obsnet.signals.cepstrogram import noise_std
@@ -138,10 +138,19 @@ def _examples(sets: Sequence[PreparedSet], split: str, config: RangeTaskConfig) 
 
 
 class RangeProblem:
-    """The range network with its loss; `ship_share` of the examples have a ship."""
+    """The range network with its loss; `ship_share` of the examples have a ship.
 
-    def __init__(self, network: RangeNetwork, ship_share: float, task: RangeTaskConfig) -> None:
-        self.network, self.ship_share, self.task = network, ship_share, task
+    Where it was another `before`, it is adapted to windows that all have one.
+    """
+
+    def __init__(
+        self,
+        network: RangeNetwork,
+        ship_share: float,
+        task: RangeTaskConfig,
+        before: RangeNetwork | None = None,
+    ) -> None:
+        self.network, self.ship_share, self.task, self._before = network, ship_share, task, before
         shape = task.features.patch_shape
         self._noise = torch.full((task.features.size,), task.context_noise)
         self._noise[: int(np.prod(shape))] = task.patch_noise
@@ -154,7 +163,11 @@ class RangeProblem:
             noise = self._noise * torch.randn(features.shape, generator=generator)
             features = features + noise * (features != 0)
         ratio = self.network(features.flatten(0, 1)).reshape(features.shape[:2])
-        return range_loss(ratio, batch["log_measure"], batch["ship"], self.ship_share).mean()
+        if self._before is None:
+            return range_loss(ratio, batch["log_measure"], batch["ship"], self.ship_share).mean()
+        with torch.no_grad():
+            before = self._before(features.flatten(0, 1)).reshape(features.shape[:2])
+        return place_loss(ratio, batch["log_measure"], before).mean()
 
 
 def train(
@@ -206,21 +219,21 @@ def finetune(
 ) -> dict[str, float]:
     """Adapt trained weights to a station; the old ones are kept where the new are not better on held-out passages.
 
-    The held-out passages are the validation split's. Calibration and share of windows with a ship stay as they were: a handful
-    of passages says nothing of the sea without ships.
+    The held-out passages are the validation split's. Calibration and share of windows with a ship stay as they were, and
+    presence is held where it was: a handful of passages says nothing of the sea without ships.
     """
     network, _, features, before = restored(weights)
+    first = restored(weights)[0].eval()
     task = replace(task, features=features)
     examples = RangeExamples(sets, "train", task, empty=False)
     check = RangeExamples(sets, "validation", task, examples.prior, empty=False)
-    problem = RangeProblem(network, float(before.get("ship_share", SHIP_SHARE)), task)
-    old = {name: values.clone() for name, values in network.state_dict().items()}
+    problem = RangeProblem(network, float(before.get("ship_share", SHIP_SHARE)), task, first)
     loss_before = _held_out_loss(problem, check)
     fit(problem, examples, check, folder, trainer, _settings(sets, problem))
     loss_after = _held_out_loss(problem, check)
     better = loss_after < loss_before
     if not better:
-        network.load_state_dict(old)
+        network.load_state_dict(first.state_dict())
     verdict = "kept the new weights" if better else "kept the old weights"
     say(f"held-out passages: {loss_before:.4f} nats a window before, {loss_after:.4f} after; {verdict}")
     found = {"loss_before": loss_before, "loss_after": loss_after, "adapted": float(better)}

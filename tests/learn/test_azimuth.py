@@ -14,7 +14,9 @@ from obsnet.learn.azimuth import (  # noqa: E402
     AzimuthTaskConfig,
     at_turn,
     augmented,
+    loss,
     minute_losses,
+    presence,
 )
 from obsnet.learn.calibration import Outputs, calibration_error, metrics  # noqa: E402
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters  # noqa: E402
@@ -134,21 +136,30 @@ def test_a_loud_ship_does_not_lift_the_rest_of_the_circle():
     assert float(minute_losses(lifted, batch, config)) > 2 + float(minute_losses(ratio, batch, config))
 
 
-def test_a_vessel_that_ais_does_not_show_costs_little_where_absence_is_not_known():
+def test_where_absence_is_not_known_it_is_asked_where_the_ship_is_not_whether():
     config, ais = AzimuthTaskConfig(unseen=0.1), labels([0.25], [HERE], watched=0.0)
     ratio = torch.full((1, 1, 60), -5.0)
     ratio[0, 0, 15] = 10.0
-    both, loud, lifted = ratio.clone(), ratio.clone(), ratio.clone()
-    both[0, 0, 45], loud[0, 0, 45] = 10.0, 20.0
-    lifted[0, 0, 30:] = 3.0
-    cost = [float(minute_losses(values, ais, config)) for values in (ratio, both, loud, lifted)]
-    assert cost[0] < 0.3 and cost[0] + 1.0 < cost[1] < cost[2] < 2 * np.log(10.0) + 0.2
-    assert cost[3] > cost[0] + 1.0  # a loud ship still lifts nothing
-    sure = float(minute_losses(loud, labels([0.25], [HERE]), config))
-    assert sure > 20.0
-    faint = ratio.clone()
-    faint[0, 0, 15] = 0.0
-    assert float(minute_losses(faint, ais, config)) > cost[0] + 2.0
+    cost = float(minute_losses(ratio, ais, config))
+    assert cost == pytest.approx(-np.log(0.9), abs=0.01)
+    assert float(minute_losses(ratio + 7.0, ais, config)) == pytest.approx(cost, abs=1e-5)
+    unseen = ratio.clone()
+    unseen[0, 0, 45] = 40.0  # another vessel, which AIS does not show
+    assert float(minute_losses(unseen, ais, config)) == pytest.approx(np.log(60 / 0.1), abs=1e-3)
+    assert float(minute_losses(unseen, labels([0.25], [HERE]), config)) > 30.0
+    assert (
+        float(minute_losses(unseen, labels([0.25, 0.75], [HERE, UNKNOWN], watched=0.0), config)) < cost + 0.01
+    )
+
+
+def test_an_adaptation_to_passages_holds_presence_where_it_was():
+    config, ratio = AzimuthTaskConfig(), torch.randn(2, 3, 60, generator=torch.Generator().manual_seed(1))
+    turn, state = np.full((2, 3, 1), 0.25), np.full((2, 3, 1), ABSENT)
+    batch = labels(turn, state, rows=2, minutes=3, watched=0.0) | {"weight": torch.zeros(2, 3)}
+    before = presence(ratio)
+    assert float(loss(ratio, batch, config, before)) == 0.0
+    assert float(loss(ratio + 2.0, batch, config, before)) == pytest.approx(4.0, rel=1e-5)
+    assert float(loss(ratio + 2.0, batch | {"watched": torch.ones(2)}, config, before)) == 0.0
 
 
 @pytest.mark.parametrize("unseen", [0.0, 1.0, float("nan")])

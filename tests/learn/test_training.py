@@ -12,8 +12,8 @@ from obsnet.detectors.learned import LearnedAzimuthDetector  # noqa: E402
 from obsnet.detectors.model_card import ModelFile  # noqa: E402
 from obsnet.errors import ConfigError, ModelError  # noqa: E402
 from obsnet.learn import azimuth_training as training  # noqa: E402
-from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig  # noqa: E402
-from obsnet.learn.calibration import bounded  # noqa: E402
+from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig, presence  # noqa: E402
+from obsnet.learn.calibration import bounded, outputs  # noqa: E402
 from obsnet.learn.dataset import NO_PHASOR, PreparedSet, Record  # noqa: E402
 from obsnet.learn.export import export, parity  # noqa: E402
 from obsnet.learn.networks import AzimuthNetworkConfig  # noqa: E402
@@ -340,6 +340,26 @@ def test_passages_of_which_nothing_is_known_adapt_nothing(run, tmp_path):
         made.write(Record(silent.attributes | {"absence_known": False}, silent.arrays))
     with pytest.raises(ConfigError, match="validation"):
         training.finetune(made, tmp_path / "run", run / "weights.pt", say=lambda text: None)
+
+
+def test_passages_alone_do_not_teach_that_there_always_is_a_ship(run, tmp_path):
+    passages, sea = PreparedSet(tmp_path / "passages"), PreparedSet(tmp_path / "sea")
+    for split, number in (("train", 8), ("validation", 4)):
+        for i in range(number):
+            ship = made_record(f"{split}-{i}", split, True, 500 * number + i)
+            passages.write(Record(ship.attributes | {"absence_known": False}, ship.arrays))
+    for i in range(4):
+        sea.write(made_record(f"test-{i}", "test", False, 70 + i))
+    trainer = replace(TRAINER, epochs=4, learning_rate=5e-3)
+    training.finetune(passages, tmp_path / "new", run / "weights.pt", trainer=trainer, say=lambda text: None)
+    network, _, about = training.restored(tmp_path / "new" / "weights.pt")
+    assert about["finetune"]["adapted"]
+    rows = AzimuthRows(sea, "test")
+    before, after = (
+        presence(outputs(each, rows).ratio).mean()
+        for each in (training.restored(run / "weights.pt")[0], network)
+    )
+    assert float(after - before) < 0.2
 
 
 def test_finetuning_keeps_the_old_weights_unless_held_out_passages_are_better(run, prepared, tmp_path):
