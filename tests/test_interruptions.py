@@ -9,6 +9,7 @@ BEGIN = """
 import io, os, signal, sys
 import numpy as np
 folder, asked = sys.argv[1], int(sys.argv[2])
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell are started deaf to it
 calls = []
 def called():
     if len(calls) == asked:

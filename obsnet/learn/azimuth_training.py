@@ -18,7 +18,7 @@ from obsnet.learn.calibration import Calibration, apply, calibrate, metrics, out
 from obsnet.learn.dataset import JoinedSets, PreparedSet
 from obsnet.learn.networks import AzimuthNetwork, AzimuthNetworkConfig, parameters
 from obsnet.learn.prepare import provenance
-from obsnet.learn.task import TrainerConfig, fit, load_weights, save_weights, seeded
+from obsnet.learn.task import TrainerConfig, calibrated_anew, fit, load_weights, save_weights, seeded
 from obsnet.output import prepare_folder
 
 WEIGHTS = "weights.pt"
@@ -65,10 +65,8 @@ def train(
     """
     if begin_with and not trainer.epochs:
         old, before, earlier = restored(begin_with)
-        trained = {key: earlier.get(key) for key in ("trainer", "labels", "made", "data_digest")}
-        about = {"trained": earlier.get("trained", trained), **(about or {})}
         labels = replace(labels, prior_odds=before.prior_odds)
-        return finish(old, prepared, folder, labels, trainer, about, say)
+        return finish(old, prepared, folder, labels, trainer, calibrated_anew(earlier, about), say)
     rows = AzimuthRows(prepared, "train", labels)
     check = AzimuthRows(prepared, "validation", labels)
     labels = replace(labels, prior_odds=prior_odds(rows))

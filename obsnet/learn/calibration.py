@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from obsnet.learn.azimuth import HERE, AzimuthRows, AzimuthTaskConfig, Batch, at_turn, minute_losses
+from obsnet.learn.azimuth import HERE, AzimuthRows, AzimuthTaskConfig, Batch, at_turn, minute_losses, presence
 from obsnet.learn.networks import AzimuthNetwork
 
 ENOUGH = 100
@@ -165,13 +165,13 @@ def metrics(
     here = (said.batch["state"] == HERE).sum(2)
     any_unknown = (said.batch["state"] == 2).any(2)
     one, none = weight & (here == 1) & ~any_unknown, weight & (here == 0) & ~any_unknown
-    presence = torch.logsumexp(ratio, 2) - np.log(ratio.shape[2])
-    alarm = presence > threshold
+    there = presence(ratio)
+    alarm = there > threshold
     best = ratio.argmax(2).float() / ratio.shape[2]
     apart = ((best[..., None] - said.batch["turn"] + 0.5) % 1.0 - 0.5).abs() * 360.0
     apart = apart / (1.0 + said.batch["doubled"][:, None, None])
     near = (apart.masked_fill(said.batch["state"] != HERE, 360.0).min(2).values < 10.0) & alarm
-    sure = torch.sigmoid(presence + np.log(odds(said)))
+    sure = torch.sigmoid(there + np.log(odds(said)))
     chosen = weight & ~any_unknown
     return {
         "nll": float((losses * weight).sum() / weight.sum()),

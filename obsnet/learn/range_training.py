@@ -27,7 +27,7 @@ from obsnet.learn.prepare import provenance
 from obsnet.learn.range_calibration import calibrate, hear, looked_at, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, place_loss, range_loss
-from obsnet.learn.task import Batch, TrainerConfig, fit, load_weights, save_weights, seeded
+from obsnet.learn.task import Batch, TrainerConfig, calibrated_anew, fit, load_weights, save_weights, seeded
 from obsnet.output import prepare_folder
 from obsnet.signals.cepstrogram import noise_std
 
@@ -193,8 +193,7 @@ def train(
         made, _, features, earlier = restored(begin_with)
         task = replace(task, features=features)
         if not trainer.epochs:
-            trained = {key: earlier.get(key) for key in ("trainer", "examples", "made", "data_digest")}
-            about = {"trained": earlier.get("trained", trained), **(about or {})}
+            about = calibrated_anew(earlier, about)
             found = {"validation_loss": float(earlier["metrics"]["validation_loss"])}
             share = float(earlier.get("ship_share", SHIP_SHARE))
             return finish(made, sets, folder, task, trainer, found, about, say, share)

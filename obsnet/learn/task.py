@@ -236,6 +236,13 @@ def save_weights(path: str | Path, network: nn.Module, about: dict[str, Any]) ->
     os.replace(partial, path)
 
 
+def calibrated_anew(earlier: dict[str, Any], about: dict[str, Any] | None) -> dict[str, Any]:
+    """What to keep with weights that are calibrated anew: `about`, and how they were trained, by their description `earlier`."""
+    kept = ("trainer", "labels", "examples", "made", "data_digest")
+    trained = {key: earlier[key] for key in kept if key in earlier}
+    return {"trained": earlier.get("trained", trained), **(about or {})}
+
+
 def load_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """State and description from `save_weights`.
 

@@ -7,6 +7,8 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 zarr = pytest.importorskip("zarr")
 
+from torch.utils.data import DataLoader  # noqa: E402
+
 from obsnet.detectors.learned_range import LearnedRangeDetector, RangeCalibration, presence_ratio  # noqa: E402
 from obsnet.detectors.range_features import RangeFeaturesConfig  # noqa: E402
 from obsnet.errors import ConfigError, ModelError  # noqa: E402
@@ -15,9 +17,10 @@ from obsnet.learn.dataset import PreparedSet, Record, packed_table  # noqa: E402
 from obsnet.learn.range_calibration import Heard, calibrate, looked_at, measure  # noqa: E402
 from obsnet.learn.range_examples import RangeExamplesConfig  # noqa: E402
 from obsnet.learn.range_export import export_range, range_parity  # noqa: E402
-from obsnet.learn.range_network import RangeNetworkConfig  # noqa: E402
+from obsnet.learn.range_network import RangeNetworkConfig, place_loss  # noqa: E402
 from obsnet.learn.range_records import HydrophoneData, draw_record, prepare_hydrophone  # noqa: E402
 from obsnet.learn.range_training import (  # noqa: E402
+    RangeExamples,
     RangeTaskConfig,
     cepstrogram_of,
     finetune,
@@ -142,6 +145,30 @@ def test_adapting_keeps_what_is_better_and_needs_no_empty_sea(trained, prepared,
     assert kept["adapted"] == 0.0
     old, new = (restored(path)[0].state_dict() for path in (trained[0], tmp_path / "wild" / "weights.pt"))
     assert all(torch.equal(old[name], new[name]) for name in old)
+
+
+def test_an_adaptation_is_asked_where_the_ship_is_and_pays_for_another_presence():
+    ratio = torch.randn(5, 9, generator=torch.Generator().manual_seed(1))
+    measure = torch.full((5, 8), -np.log(8.0))
+    said = place_loss(ratio, measure, ratio)
+    expected = torch.logsumexp(ratio[:, 1:], 1) - np.log(8.0) - ratio[:, 0]
+    torch.testing.assert_close(said, expected)
+    torch.testing.assert_close(place_loss(ratio + 3.0, measure, ratio), said + 9.0)
+
+
+def test_passages_are_asked_where_the_ship_is_not_whether(trained, prepared, tmp_path):
+    ships = PreparedSet(tmp_path / "archive")
+    for name in ("r0", "r2"):
+        ships.write(prepared.read(name))
+    once = TrainerConfig(epochs=1, batch=8)
+    found = finetune([ships], tmp_path / "run", trained[0], TASK, once, say=lambda text: None)
+    network = restored(trained[0])[0].eval()
+    held, costs = RangeExamples([ships], "validation", TASK, empty=False), []
+    for batch in DataLoader(held, 64):
+        with torch.no_grad():
+            said = network(batch["features"].flatten(0, 1)).reshape(batch["features"].shape[:2])
+        costs.append(place_loss(said, batch["log_measure"], said))
+    assert found["loss_before"] == pytest.approx(float(torch.cat(costs).mean()), rel=1e-4)
 
 
 def test_records_give_back_what_was_heard_and_known(prepared):
