@@ -244,7 +244,9 @@ def twin_record(
         "directional_fraction": scene.scenario.ambient.directional_fraction
         if scene.scenario.ambient
         else 0.0,
+        "lobes": len(scene.scenario.lobes),
         "whales": len(scene.scenario.whales),
+        "earthquakes_per_day": scene.scenario.earthquakes.per_day if scene.scenario.earthquakes else 0.0,
         "tremor": scene.scenario.tremor is not None,
         "gaps": len(scene.scenario.faults.gaps),
         "source_levels_db": [p.ship.source_level_db for p in scene.scenario.passages],

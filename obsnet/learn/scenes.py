@@ -20,8 +20,10 @@ from obsnet.learn.oceans import Ocean, OceanSpread, draw_ocean
 from obsnet.twin.course import Course, TurningCourse
 from obsnet.twin.instrument import Recorder
 from obsnet.twin.scenario import Passage, Scenario
-from obsnet.twin.sea import Ambient
+from obsnet.twin.sea import Ambient, Lobe
+from obsnet.twin.seafloor import Earthquakes
 from obsnet.twin.ship import Ship
+from obsnet.twin.whales import Whale
 
 SPLIT_SEEDS = 1_000_000
 """What lies between the seeds of the splits: no split hears another's ships, noise or whales."""
@@ -54,6 +56,8 @@ class SceneConfig:
         network must not take for the sea; the lines of the others lie `line_shift_db` above (or below) what the twin draws.
     orientation_error_deg : standard deviation of what StationXML says of the horizontals.
     without_z, without_hydrophone, without_horizontals : shares of records that lack a channel.
+    lobe_shares : probabilities of 0, 1, 2 … lobes of noise that turn and swell. choir_share, swarm_share : shares of records with
+        whales that sing at any pitch and pace, and with swarms of earthquakes.
     start : first sample of the drawn records, ISO 8601; courses after AIS keep their own times.
     """
 
@@ -68,6 +72,9 @@ class SceneConfig:
     without_z: float = 0.15
     without_hydrophone: float = 0.1
     without_horizontals: float = 0.04
+    lobe_shares: tuple[float, ...] = (0.4, 0.4, 0.2)
+    choir_share: float = 0.45
+    swarm_share: float = 0.25
     start: str = "2012-11-01T00:00:00Z"
 
 
@@ -116,7 +123,8 @@ def draw_scene(
             for i in range(number)
         )
     scenario = Scenario.random(own, config.hours, 0, start, recorder=recorder, passages=passages)
-    scenario = scenario.replace(ambient=_ambient(generator))
+    life = _life(np.random.default_rng([seed, 0x11FE, number_of_split]), scenario, config)
+    scenario = scenario.replace(ambient=_ambient(generator), **life)
     return Scene(scenario, ocean, float(generator.normal(0.0, config.orientation_error_deg)))
 
 
@@ -173,6 +181,57 @@ def _ambient(generator: np.random.Generator) -> Ambient:
         directional_elevation_deg=float(generator.uniform(0.0, 50.0)),
         directional_width_deg=float(generator.uniform(10.0, 60.0)),
         horizontal_share=float(generator.uniform(0.2, 0.5)),
+    )
+
+
+def _life(generator: np.random.Generator, scenario: Scenario, config: SceneConfig) -> dict[str, object]:
+    """What moves, or begins and ends, without being a ship: lobes of noise, whales that sing as nowhere, swarms of earthquakes."""
+    number = generator.choice(len(config.lobe_shares), p=config.lobe_shares)
+    lobes = tuple(_lobe(generator, scenario.start) for _ in range(number))
+    whales = scenario.whales
+    if generator.random() < config.choir_share:
+        count = int(generator.integers(1, 5))
+        whales += tuple(_singer(generator, scenario.start, scenario.end) for _ in range(count))
+    earthquakes = scenario.earthquakes
+    if generator.random() < config.swarm_share:
+        earthquakes = Earthquakes(
+            per_day=float(np.exp(generator.uniform(np.log(20.0), np.log(800.0)))),
+            level_db=float(generator.uniform(95.0, 125.0)),
+            level_spread_db=float(generator.uniform(5.0, 14.0)),
+            seed=int(generator.integers(2**31)),
+            t_gain=float(np.exp(generator.uniform(np.log(0.3), np.log(5.0)))),
+            t_stretch=float(generator.uniform(0.5, 2.5)),
+        )
+    return {"lobes": lobes, "whales": whales, "earthquakes": earthquakes}
+
+
+def _lobe(generator: np.random.Generator, since: float) -> Lobe:
+    turning = generator.normal(0.0, 1.0) if generator.random() < 0.4 else generator.normal(0.0, 15.0)
+    return Lobe(
+        level_db=float(generator.uniform(62.0, 84.0)),
+        slope_db=float(generator.uniform(0.0, 32.0)),
+        azimuth_deg=float(generator.uniform(0.0, 360.0)),
+        width_deg=float(generator.uniform(6.0, 60.0)),
+        elevation_deg=float(generator.uniform(0.0, 40.0)),
+        turning_deg_per_h=float(turning),
+        wander_deg=float(generator.uniform(0.0, 15.0)) if generator.random() < 0.5 else 0.0,
+        swell_db=float(generator.uniform(0.0, 4.0)),
+        since=since,
+        seed=int(generator.integers(2**31)),
+    )
+
+
+def _singer(generator: np.random.Generator, start: float, end: float) -> Whale:
+    whale = Whale.random(generator, start, end)
+    always = generator.random() < 0.5
+    return replace(
+        whale,
+        source_level_db=float(generator.uniform(178.0, 194.0)),
+        span=(-np.inf, np.inf) if always else whale.span,
+        pitch=float(np.exp(generator.normal(0.0, 0.18))),
+        pace=float(np.exp(generator.uniform(-0.7, 0.9))),
+        length=float(np.exp(generator.uniform(-0.6, 0.3))),
+        level_spread_db=float(generator.uniform(0.0, 3.0)),
     )
 
 

@@ -18,7 +18,7 @@ from obsnet.twin.course import Course, WaypointCourse
 from obsnet.twin.faults import Faults
 from obsnet.twin.instrument import Recorder
 from obsnet.twin.propagate import Sediment
-from obsnet.twin.sea import Ambient
+from obsnet.twin.sea import Ambient, Lobe
 from obsnet.twin.seafloor import Earthquakes, Tremor
 from obsnet.twin.ship import Ship
 from obsnet.twin.whales import Whale
@@ -51,6 +51,8 @@ class Scenario:
         The station.
     ambient : Ambient or None
         The background; None is silence.
+    lobes : tuple of Lobe
+        Noise from one side that turns and swells.
     whales : tuple of Whale
     earthquakes : Earthquakes or None
     tremor : Tremor or None
@@ -72,6 +74,7 @@ class Scenario:
     passages: tuple[Passage, ...] = ()
     recorder: Recorder = field(default_factory=Recorder)
     ambient: Ambient | None = field(default_factory=Ambient)
+    lobes: tuple[Lobe, ...] = ()
     whales: tuple[Whale, ...] = ()
     earthquakes: Earthquakes | None = None
     tremor: Tremor | None = None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsnet.errors import ConfigError
-from obsnet.twin.noise import Wander, below_nyquist, gaussian_noise
+from obsnet.twin.noise import Wander, below_nyquist, gaussian_noise, named
 from obsnet.twin.propagate import Field
 
 IMPEDANCE = 1030.0 * 1520.0
@@ -128,6 +128,76 @@ class Ambient:
         return self.sea_psd(frequency) + self.microseism_psd(frequency) + own
 
 
+@dataclass(frozen=True)
+class Lobe:
+    """Noise from one side that turns and swells: distant shipping together, a storm that moves, surf on a coast.
+
+    Parameters
+    ----------
+    level_db : float
+        PSD of its pressure at 15 Hz, dB re 1 µPa²/Hz.
+    slope_db : float
+        Its fall, dB per decade.
+    azimuth_deg : float
+        Azimuth from the station to its middle at `since`.
+    width_deg : float
+        Standard deviation of the azimuths that it comes from.
+    elevation_deg : float
+        Grazing angle at which it arrives.
+    turning_deg_per_h : float
+        How fast its middle turns.
+    wander_deg : float
+        Standard deviation of its middle about that.
+    swell_db : float
+        Standard deviation of its level's changes, within minutes to hours.
+    since : float
+        s since 1970.
+    seed : int
+        Names the realisation.
+    """
+
+    level_db: float = 74.0
+    slope_db: float = 18.0
+    azimuth_deg: float = 90.0
+    width_deg: float = 20.0
+    elevation_deg: float = 15.0
+    turning_deg_per_h: float = 0.0
+    wander_deg: float = 0.0
+    swell_db: float = 0.0
+    since: float = 0.0
+    seed: int = 0
+
+    def azimuth(self, time: np.ndarray) -> np.ndarray:
+        """Azimuth to its middle [deg] at `time` [s since 1970], not wrapped."""
+        wander = Wander(np.random.default_rng(named(self.seed, 14)), self.wander_deg, 900.0, 6 * 3600.0)
+        turned = self.turning_deg_per_h * (np.asarray(time, float) - self.since) / 3600.0
+        return self.azimuth_deg + turned + wander(time)
+
+
+def add_lobe(field: Field, first: int, sampling_rate: float, lobe: Lobe) -> None:
+    """Add a lobe to `field`, whose samples begin at `first` since 1970: made towards north, and turned sample by sample."""
+
+    def colour(frequency: np.ndarray, z: np.ndarray) -> np.ndarray:
+        hertz = np.maximum(frequency, 2.0)
+        psd = _power(lobe.level_db - 120.0) * (hertz / REFERENCE_HZ) ** (-lobe.slope_db / 10)
+        return _amplitude(psd, below_nyquist(frequency, sampling_rate)) * np.tensordot(parts, z, 1)
+
+    parts = _directions(0.0, lobe.elevation_deg, lobe.width_deg)
+    count = field.pressure.size
+    noise = gaussian_noise((lobe.seed, 13), first, count, sampling_rate, colour, draws=parts.shape[1])
+    swell = Wander(np.random.default_rng(named(lobe.seed, 15)), lobe.swell_db, 300.0, 3 * 3600.0)
+    samples, knots = _knots(first, count, sampling_rate)
+    time = knots / sampling_rate
+    noise *= np.interp(samples, knots, 10 ** (swell(time) / 20)).astype(np.float32)
+    turned = np.deg2rad(np.interp(samples, knots, lobe.azimuth(time)))
+    sine, cosine = np.sin(turned), np.cos(turned)
+    pressure, across, along, down = noise
+    field.pressure[:] += pressure
+    field.east[:] += along * sine + across * cosine
+    field.north[:] += along * cosine - across * sine
+    field.down[:] += down
+
+
 def add_ambient(field: Field, first: int, sampling_rate: float, ambient: Ambient, seed: int) -> None:
     """Add the background to `field`, whose samples begin at `first` since 1970."""
 
@@ -144,7 +214,9 @@ def add_ambient(field: Field, first: int, sampling_rate: float, ambient: Ambient
             )
         )
 
-    directions = _directions(ambient)
+    directions = _directions(
+        ambient.directional_azimuth_deg, ambient.directional_elevation_deg, ambient.directional_width_deg
+    )
     draws = 5 + directions.shape[1]
     noise = gaussian_noise((seed, 11), first, field.pressure.size, sampling_rate, colour, draws=draws)
     gain = _level(ambient, seed, first, field.pressure.size, sampling_rate)
@@ -174,19 +246,13 @@ class _Gains:
         self.directional = _amplitude(directional, edge)
 
 
-def _directions(ambient: Ambient) -> np.ndarray:
-    """Pressure, and velocity east, north, down over it, of independent parts of the directional noise (4, part), float32.
+def _directions(azimuth_deg: float, elevation_deg: float, width_deg: float) -> np.ndarray:
+    """Pressure, and velocity east, north, down over it, of independent parts of directional noise (4, part), float32.
 
     From one point it is a single plane wave. From a sector it is a sum of countless ones, Gaussian as they are: all that is left
     of them is the covariance of the four channels, of which these columns are a root.
     """
-    azimuth, elevation, width = np.deg2rad(
-        [
-            ambient.directional_azimuth_deg,
-            ambient.directional_elevation_deg,
-            ambient.directional_width_deg,
-        ]
-    )
+    azimuth, elevation, width = np.deg2rad([azimuth_deg, elevation_deg, width_deg])
     horizontal, down = -np.cos(elevation) / IMPEDANCE, np.sin(elevation) / IMPEDANCE
     nodes = np.linspace(-3.0, 3.0, 61) if width else np.zeros(1)
     weight = np.exp(-0.5 * nodes**2)
@@ -208,10 +274,14 @@ def _directions(ambient: Ambient) -> np.ndarray:
 
 def _level(ambient: Ambient, seed: int, first: int, count: int, sampling_rate: float) -> np.ndarray:
     wander = Wander(np.random.default_rng([seed, 12]), ambient.level_spread_db, 1800.0, 24 * 3600.0)
-    samples = np.arange(first, first + count)
-    step = max(round(LEVEL_KNOT_S * sampling_rate), 1)
-    knots = np.arange(first // step, (first + count) // step + 2) * step
+    samples, knots = _knots(first, count, sampling_rate)
     return np.interp(samples, knots, 10 ** (wander(knots / sampling_rate) / 20))
+
+
+def _knots(first: int, count: int, sampling_rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the samples, and those between which what changes slowly is interpolated, the same however a record is split."""
+    step = max(round(LEVEL_KNOT_S * sampling_rate), 1)
+    return np.arange(first, first + count), np.arange(first // step, (first + count) // step + 2) * step
 
 
 def _power(level_db: float) -> float:

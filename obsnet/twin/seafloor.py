@@ -33,16 +33,24 @@ class Earthquakes:
         Standard deviation of that.
     seed : int
         Names the sequence.
+    t_gain, t_stretch : float
+        Strength and length of the T phases over the usual: those of distant earthquakes come without P and S that are heard.
     """
 
     per_day: float = 6.0
     level_db: float = 112.0
     level_spread_db: float = 10.0
     seed: int = 0
+    t_gain: float = 1.0
+    t_stretch: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.per_day >= 0:
             raise ConfigError(f"per_day must be 0 or more, found {self.per_day}")
+        if not (self.t_gain >= 0 and 0 < self.t_stretch <= 4):
+            raise ConfigError(
+                f"t_gain must be 0 or more and t_stretch lie between 0 and 4, found {self.t_gain} and {self.t_stretch}"
+            )
 
     def events(self, start: float, end: float) -> list[tuple[float, int]]:
         """Times [s since 1970] and seeds of the events between `start` and `end`."""
@@ -88,7 +96,9 @@ def _event(generator: np.random.Generator, earthquakes: Earthquakes, sampling_ra
     elapsed = np.arange(size) / sampling_rate
     p = noise[0] * _envelope(elapsed, 0.0, 0.3, 3.0 + 0.15 * s_minus_p)
     s = noise[1:3] * _envelope(elapsed, s_minus_p, 0.6, 5.0 + 0.25 * s_minus_p)
-    t = noise[3] * _envelope(elapsed, 2.0 * s_minus_p + 10.0, 15.0, 25.0) * t_level
+    stretch = earthquakes.t_stretch
+    t = noise[3] * _envelope(elapsed, 2.0 * s_minus_p + 10.0, 15.0 * stretch, 25.0 * stretch)
+    t *= t_level * earthquakes.t_gain
     down = noise[4] * _envelope(elapsed, s_minus_p, 0.6, 5.0 + 0.25 * s_minus_p)
     radial = (incidence * p + 0.8 * t) / IMPEDANCE
     return level * np.stack(

@@ -25,7 +25,7 @@ from obsnet.twin.instrument import Recorder
 from obsnet.twin.noise import sample_index
 from obsnet.twin.propagate import OVERSAMPLING, Field, Paths, add_moving_source
 from obsnet.twin.scenario import DEFAULT_START, Passage, Scenario
-from obsnet.twin.sea import add_ambient
+from obsnet.twin.sea import add_ambient, add_lobe
 from obsnet.twin.seafloor import add_earthquakes, add_tremor
 from obsnet.twin.ship import Emission
 from obsnet.twin.truth import Truth, ais_of, truth_of
@@ -284,6 +284,8 @@ def _fill(motion: Field, first: int, scenario: Scenario, emissions: list[Emissio
         add_moving_source(motion, first, rate, passage.course, passage.ship.source_depth_m, emission, paths)
     if scenario.ambient is not None:
         add_ambient(motion, first, rate, scenario.ambient, scenario.seed)
+    for lobe in scenario.lobes:
+        add_lobe(motion, first, rate, lobe)
     for whale in scenario.whales:
         add_whale(motion, first, rate, whale, paths)
     if scenario.earthquakes is not None:

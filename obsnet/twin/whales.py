@@ -4,7 +4,7 @@ whale is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numba
@@ -75,6 +75,12 @@ class Whale:
         It calls between these times, s since 1970.
     seed : int
         Names its sequence.
+    pitch, pace : float
+        Frequencies, and seconds from call to call, over those of the species' song: songs differ among oceans and years.
+    length : float
+        Duration of a call over that of the song.
+    level_spread_db : float
+        Standard deviation of the calls' levels.
     """
 
     species: Species = "fin"
@@ -83,12 +89,35 @@ class Whale:
     depth_m: float = 20.0
     span: tuple[float, float] = (-np.inf, np.inf)
     seed: int = 0
+    pitch: float = 1.0
+    pace: float = 1.0
+    length: float = 1.0
+    level_spread_db: float = 0.0
 
     def __post_init__(self) -> None:
         if self.species not in SONGS:
             raise ConfigError(f"species must be one of {', '.join(SONGS)}, found {self.species!r}")
         if not self.depth_m > 0:
             raise ConfigError(f"a whale's depth must be positive, found {self.depth_m}")
+        if not (self.pitch > 0 and self.pace > 0 and self.length > 0):
+            raise ConfigError(
+                f"a whale's pitch, pace and length must be positive, found {self.pitch}, {self.pace}, {self.length}"
+            )
+
+    @property
+    def song(self) -> Song:
+        """What it sings: its species' song at its own pitch, pace and length."""
+        song = SONGS[self.species]
+        units = tuple(
+            Unit(
+                u.start_s * self.length,
+                u.duration_s * self.length,
+                u.from_hz * self.pitch,
+                u.to_hz * self.pitch,
+            )
+            for u in song.units
+        )
+        return replace(song, units=units, interval_s=song.interval_s * self.pace)
 
     @classmethod
     def random(cls, generator: np.random.Generator, start: float, end: float) -> Whale:
@@ -114,10 +143,14 @@ class Whale:
 
     def calls(self, start: float, end: float) -> np.ndarray:
         """Times at which its calls begin between `start` and `end` [s since 1970]."""
-        song = SONGS[self.species]
+        return self._calls(start, end)[0]
+
+    def _calls(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times and numbers of the calls."""
+        song = self.song
         start, end = max(start, self.span[0]), min(end, self.span[1])
         if not end > start:
-            return np.empty(0)
+            return np.empty(0), np.empty(0, np.int64)
         first, last = int(start // song.interval_s) - 2, int(end // song.interval_s) + 3
         blocks = range(first // CALLS_PER_DRAW, last // CALLS_PER_DRAW + 1)
         shifts = np.concatenate(
@@ -129,16 +162,22 @@ class Whale:
         number = np.arange(blocks.start * CALLS_PER_DRAW, blocks.stop * CALLS_PER_DRAW)
         times = (number + song.jitter * shifts) * song.interval_s
         singing = (number + self.seed) % (song.bout + song.rest) < song.bout
-        return times[singing & (times >= start) & (times < end)]
+        chosen = singing & (times >= start) & (times < end)
+        return times[chosen], number[chosen]
+
+    def _levels(self, numbers: np.ndarray) -> np.ndarray:
+        """Amplitude of each call [Pa at 1 m]."""
+        spread = np.array([np.random.default_rng(named(self.seed, 22, int(n))).normal() for n in numbers])
+        return np.sqrt(2.0) * 1e-6 * 10 ** ((self.source_level_db + self.level_spread_db * spread) / 20)
 
 
 def add_whale(field: Field, first: int, sampling_rate: float, whale: Whale, paths: Paths) -> None:
     """Add a whale's calls to `field`, whose samples begin at `first` since 1970."""
     start, count = first / sampling_rate, field.pressure.size
-    song = SONGS[whale.species]
+    song = whale.song
     longest = max(unit.start_s + unit.duration_s for unit in song.units)
-    calls = whale.calls(start - paths.longest_delay_s - longest, start + count / sampling_rate)
-    amplitude = np.sqrt(2.0) * 1e-6 * 10 ** (whale.source_level_db / 20)
+    calls, numbers = whale._calls(start - paths.longest_delay_s - longest, start + count / sampling_rate)
+    amplitude = whale._levels(numbers)
     units = np.array([[u.start_s, u.duration_s, u.from_hz, u.to_hz] for u in song.units])
     hertz = np.linspace(0.0, 100.0, 2001)
     edge = below_nyquist(hertz, sampling_rate)

@@ -21,7 +21,8 @@ from obsnet.twin.station import write_simulation
 STATION = (-21.0, 54.0)
 START = parse_utc("2012-11-01") / 1e9
 LOUD = SceneConfig(hours=0.7, ship_shares=(0.0, 1.0), source_level_db=205.0, source_level_spread_db=0.1,
-                   without_z=0.0, without_hydrophone=0.0, without_horizontals=0.0)  # fmt: skip
+                   without_z=0.0, without_hydrophone=0.0, without_horizontals=0.0, lobe_shares=(1.0,), choir_share=0.0,
+                   swarm_share=0.0)  # fmt: skip
 
 
 def straight(minutes, speed=8.0, offset=5000.0):
@@ -65,6 +66,10 @@ def test_scenes_are_drawn_from_their_seed_and_differ():
     assert {0, 1, 2} <= {len(scene.passages) for scene in scenes}
     assert len({scene.recorder.components for scene in scenes}) >= 3
     assert {scene.recorder.sampling_rate for scene in scenes} > {50.0}
+    assert {0, 1, 2} == {len(scene.lobes) for scene in scenes}
+    assert max(scene.earthquakes.per_day for scene in scenes) > 50.0
+    assert max(len(scene.whales) for scene in scenes if scene.passages) >= 3
+    assert max(len(scene.whales) for scene in scenes if not scene.passages) >= 3
     quiet = [scene.ambient.directional_fraction for scene in scenes if not scene.passages]
     loud = [scene.ambient.directional_fraction for scene in scenes if scene.passages]
     assert min(max(quiet), max(loud)) > 0.5 and max(min(quiet), min(loud)) < 0.4

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from obsnet.errors import ConfigError
 from obsnet.twin.noise import gaussian_noise
 from obsnet.twin.propagate import Field
-from obsnet.twin.sea import IMPEDANCE, Ambient, add_ambient
+from obsnet.twin.sea import IMPEDANCE, Ambient, Lobe, add_ambient, add_lobe
 
 RATE = 50.0
 FIRST = 50 * 1369130400
@@ -39,6 +39,48 @@ def frames(values: np.ndarray) -> np.ndarray:
 def test_level_of_the_sea_noise_at_15_hz(level):
     field = background(Ambient(level_db=level, level_spread_db=0.0))
     assert level_db(field.pressure, 15.0) == pytest.approx(level, abs=0.3)
+
+
+def of_lobe(lobe: Lobe, first: int = FIRST, count: int = 180_000) -> Field:
+    field = Field.silence(count)
+    add_lobe(field, first, RATE, lobe)
+    return field
+
+
+def azimuth_of(field: Field, part: slice = slice(None)) -> float:
+    east, north = (-np.mean(field.pressure[part] * v[part]) for v in (field.east, field.north))
+    return float(np.rad2deg(np.arctan2(east, north)) % 360.0)
+
+
+def test_a_lobe_has_its_level_and_points_to_where_it_comes_from():
+    lobe = Lobe(level_db=80.0, azimuth_deg=215.0, width_deg=15.0, elevation_deg=0.0, seed=4)
+    field = of_lobe(lobe)
+    assert level_db(field.pressure, 15.0) == pytest.approx(80.0, abs=0.3)
+    assert azimuth_of(field) == pytest.approx(215.0, abs=1.0)
+    # A wave of one direction has E_v = E_p; across the lobe's middle lies the share sin² of its width.
+    along, across = np.deg2rad(215.0), np.deg2rad(125.0)
+    parts = [field.east * np.sin(angle) + field.north * np.cos(angle) for angle in (along, across)]
+    share = np.var(parts[1]) / (np.var(parts[0]) + np.var(parts[1]))
+    assert share == pytest.approx(0.5 * (1 - np.exp(-2 * np.deg2rad(15.0) ** 2)), abs=0.01)
+    assert np.var(field.pressure) == pytest.approx(
+        IMPEDANCE**2 * np.var(np.stack(parts), axis=1).sum(), rel=0.05
+    )
+
+
+def test_a_lobe_turns_swells_and_is_the_same_however_it_is_cut():
+    lobe = Lobe(azimuth_deg=350.0, turning_deg_per_h=30.0, since=FIRST / RATE, swell_db=3.0, seed=2)
+    field = of_lobe(lobe)
+    assert azimuth_of(field, slice(0, 30_000)) == pytest.approx(355.0 - 2.5, abs=4.0)
+    assert azimuth_of(field, slice(150_000, None)) == pytest.approx(17.5, abs=4.0)
+    minutes = 10 * np.log10(np.mean(field.pressure.reshape(60, 3000) ** 2, axis=1))
+    steady = of_lobe(Lobe(seed=2))
+    assert (
+        np.std(minutes) > np.std(10 * np.log10(np.mean(steady.pressure.reshape(60, 3000) ** 2, axis=1))) + 1.0
+    )
+    part = of_lobe(lobe, FIRST + 40_000, 30_000)
+    for name in ("pressure", "east", "north", "down"):
+        expected = getattr(field, name)[40_000:70_000]
+        np.testing.assert_allclose(getattr(part, name), expected, atol=2e-3 * np.std(expected))
 
 
 def test_spectrum_falls_as_asked_and_carries_the_microseism():

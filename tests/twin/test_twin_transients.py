@@ -2,6 +2,8 @@
 cut the same.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,11 +85,42 @@ def test_calls_come_at_their_interval_in_bouts():
     )
 
 
+def test_a_whale_sings_at_its_own_pitch_pace_and_length(paths):
+    usual = Whale("fin", at(0.0, 3000.0), seed=3)
+    other = replace(usual, pitch=0.8, pace=1.5, length=0.5)
+    steps = [np.median(np.diff(whale.calls(START, START + 3600.0))) for whale in (usual, other)]
+    assert steps[1] / steps[0] == pytest.approx(1.5, abs=0.05)
+    middles, lengths = [], []
+    for whale in (usual, other):
+        field = Field.silence(int(5 * RATE))
+        add_whale(field, int(first_call(whale) * RATE), RATE, whale, paths)
+        power = np.abs(np.fft.rfft(field.pressure)) ** 2
+        middles.append(np.sum(np.fft.rfftfreq(field.pressure.size, 1 / RATE) * power) / np.sum(power))
+        lengths.append(np.sum(np.abs(field.pressure) > 0.1 * np.abs(field.pressure).max()))
+    assert middles[1] / middles[0] == pytest.approx(0.8, abs=0.02)
+    assert lengths[1] / lengths[0] == pytest.approx(0.5, abs=0.12)
+
+
+def test_calls_of_a_whale_differ_in_level_by_as_much_as_is_said(paths):
+    def peaks(spread: float) -> np.ndarray:
+        whale = Whale("fin", at(0.0, 3000.0), seed=3, level_spread_db=spread)
+        found = []
+        for call in whale.calls(START, START + 600.0):
+            field = Field.silence(int(4 * RATE))
+            add_whale(field, int((call + 2.0) * RATE), RATE, replace(whale, span=(call - 1, call + 1)), paths)
+            found.append(20 * np.log10(np.abs(field.pressure).max()))
+        return np.array(found)
+
+    assert np.std(peaks(0.0)) < 0.05
+    assert np.std(peaks(4.0)) == pytest.approx(4.0, abs=1.5)
+
+
 @pytest.mark.parametrize("kind", ["whale", "earthquakes", "tremor"])
 def test_any_part_equals_the_cut_from_the_whole(paths, kind):
     def add(field, first):
         if kind == "whale":
-            add_whale(field, first, RATE, Whale("blue_z", at(10.0, 8000.0), seed=1), paths)
+            singer = Whale("blue_z", at(10.0, 8000.0), seed=1, pace=0.7, level_spread_db=3.0)
+            add_whale(field, first, RATE, singer, paths)
         elif kind == "earthquakes":
             add_earthquakes(field, first, RATE, Earthquakes(per_day=300.0, seed=1))
         else:
@@ -121,6 +154,20 @@ def test_earthquakes_come_at_their_rate_on_every_component():
     for values in (field.pressure, field.east, field.north, field.down):
         assert np.abs(values[: int(19 * RATE)]).max() == 0.0
         assert np.abs(values[int(20 * RATE) :]).max() > 0.0
+
+
+def test_t_phases_are_as_strong_and_as_long_as_asked():
+    usual = Earthquakes(per_day=12.0, seed=3)
+    time = usual.events(START, START + 10 * 86400.0)[1][0]
+
+    def late(earthquakes: Earthquakes) -> float:
+        field = Field.silence(int(390 * RATE))
+        add_earthquakes(field, round(time * RATE), RATE, earthquakes)
+        return float(np.std(field.pressure[int(200 * RATE) :]))
+
+    assert late(replace(usual, t_gain=0.0)) < 0.1 * late(usual)
+    assert late(replace(usual, t_gain=3.0)) == pytest.approx(3.0 * late(usual), rel=0.1)
+    assert late(replace(usual, t_stretch=2.0)) > 2.0 * late(usual)
 
 
 def test_p_wave_comes_from_below():
