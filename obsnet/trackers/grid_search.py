@@ -33,7 +33,7 @@ from obsnet.trackers.posterior import Posterior, posterior
 from obsnet.trackers.remainder import Ghosts, Remainder
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, range_scores, tiles
 from obsnet.trackers.search_config import COARSE, FINE, MEDIUM, SMOOTHING, GridSearchConfig, Level
-from obsnet.trackers.steady import fixed_source, two_steady
+from obsnet.trackers.steady import SWIMS, fixed_source, swimming_source, two_steady
 from obsnet.trackers.track import USUAL_MPS, Segment, Track, usual
 from obsnet.trackers.verdict import (
     as_stated,
@@ -53,6 +53,9 @@ COARSE_SHARE = 0.6
 
 POINTED = 4.0
 """What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's, and located sharply."""
+
+SLOW = 2.0
+"""Times the least speed of a ship below which a track must outdo a source that swims."""
 
 SILENT = 3.0
 """What range maps say for a ship at least whose range is heard; else what they say against others says little of other seas."""
@@ -327,6 +330,9 @@ class _Finder:
         fixed = (
             fixed_source(self.tiles, scores, lo, hi, config.still_deg_per_hour) if self.sees_course else 0.0
         )
+        if not silent and mean[3] < SLOW * config.min_speed_mps:
+            swims = SWIMS * config.min_speed_mps
+            fixed = max(fixed, swimming_source(best, self.tiles, self.delay, scores, lo, hi, swims))
         method = "grid search" if self.sees_course else "grid search, no azimuth maps: course not observed"
         if silent:
             method = f"grid search, no range {'heard' if self.sees_range else 'maps'}"

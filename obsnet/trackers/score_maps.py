@@ -54,6 +54,10 @@ class ScoreMaps:
         """The same with range maps that say nothing."""
         return replace(self, range_score=np.zeros_like(self.range_score))
 
+    def part(self, tiles: slice) -> ScoreMaps:
+        """Those of some of the tiles."""
+        return replace(self, range_score=self.range_score[tiles], azimuth_score=self.azimuth_score[tiles])
+
     def corner(self, range_m: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Index into `flat` of the grid point below in range and rate, and how far right and up of it, in grid steps."""
         _, n_range, n_rate = self.range_score.shape

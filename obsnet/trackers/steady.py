@@ -1,4 +1,4 @@
-"""Sources that stay where they are, which a track must outdo: a singing whale, lobes of distant noise."""
+"""Sources that stay where they are or swim about, which a track must outdo: a singing whale, lobes of distant noise."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from collections.abc import Callable
 import numpy as np
 import xarray as xr
 
-from obsnet.kinematics import emission
+from obsnet.kinematics import StraightCourse, emission
+from obsnet.trackers.course_grid import Delay, score_points
 from obsnet.trackers.score_maps import ScoreMaps, azimuth_scores, tiles
 from obsnet.trackers.search_config import SMOOTHING, GridSearchConfig
 from obsnet.trackers.track import Segment, Track
+
+SWIMS = 0.8
+"""Of the least speed of a ship, the greatest of a source that swims about."""
+
+SWIM_SPEEDS, SWIM_COURSES_DEG = 4, 22.5
+SWIM_ABOUT_DEG, SWIM_ABOUT_M = np.arange(-4.0, 4.1, 2.0), np.arange(-1200.0, 1201.0, 400.0)
+"""How finely, and how far about a course's middle, one that swims is looked for."""
 
 
 def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_deg_per_hour: float) -> float:
@@ -24,6 +32,37 @@ def fixed_source(tiles: np.ndarray, scores: ScoreMaps, lo: int, hi: int, still_d
         shift = np.round(drift * hours / scores.azimuth_step).astype(int)
         best = max(best, scores.azimuth_score[held, (azimuth[:, None] + shift) % bins].sum(axis=1).max())
     return float(best)
+
+
+def swimming_source(
+    best: np.ndarray, tiles: np.ndarray, delay: Delay, scores: ScoreMaps, lo: int, hi: int, fastest_mps: float
+) -> float:
+    """Best score over the tiles lo … hi of a source about where a course is in their middle, that moves at `fastest_mps` at most.
+
+    Parameters
+    ----------
+    best : (4) CPA time [s on the clock of `tiles`], signed CPA range [m], course [deg], speed [m/s] of the course.
+    """
+    cpa_time, cpa_range, course, speed = (float(value) for value in best)
+    middle = 0.5 * float(tiles[lo] + tiles[hi])
+    azimuth, distance, _ = StraightCourse(cpa_time, cpa_range, course, speed).observables(np.array(middle))
+    steps = fastest_mps / SWIM_SPEEDS * np.arange(1, SWIM_SPEEDS + 1)
+    places = np.meshgrid(
+        np.deg2rad(azimuth + SWIM_ABOUT_DEG),
+        np.maximum(distance + SWIM_ABOUT_M, 0.0),
+        np.arange(0.0, 360.0, SWIM_COURSES_DEG),
+        steps,
+        indexing="ij",
+    )
+    towards, at, courses, speeds = (place.ravel() for place in places)
+    east, north, heading = at * np.sin(towards), at * np.cos(towards), np.deg2rad(courses)
+    ahead, side = (
+        east * np.sin(heading) + north * np.cos(heading),
+        east * np.cos(heading) - north * np.sin(heading),
+    )
+    points = np.stack([middle - ahead / speeds, side, courses, speeds], axis=1)
+    held = slice(lo, hi + 1)
+    return float(score_points(points, tiles[held], delay, scores.part(held))[0].max())
 
 
 def two_steady(azimuth_score: np.ndarray) -> float:

@@ -101,6 +101,26 @@ def test_a_detector_that_prefers_any_ship_to_none_gives_no_further_ship():
     assert len(search(maps, SEGMENT, delay)) == 1
 
 
+@pytest.mark.parametrize("speed", [1.2, 1.9])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_whale_that_swims_about_is_no_ship(speed, side):
+    """Its echoes place it as a ship's do, and heard for half an hour it seems to go at 3 or 4 m/s."""
+    whale = StraightCourse(T0 + 3000.0, side * 26_000.0, 280.0, speed)
+    minutes = MINUTES[:36]
+    for seed in range(4):
+        maps = maps_of([whale], minutes, np.random.default_rng(seed), 6.0, 500.0, 7.0, ghosts=False)
+        assert not search(maps, Segment(minutes[0], minutes[-1]), delay)
+
+
+def test_a_slow_ship_is_told_from_a_whale_within_the_hour():
+    ship = StraightCourse(T0 + 1500.0, -14_000.0, 40.0, 4.0)
+    minutes = MINUTES[:60]
+    (found,) = search(
+        maps_of([ship], minutes, np.random.default_rng(5)), Segment(minutes[0], minutes[-1]), delay
+    )
+    assert abs(found.motion.speed_mps - 4.0) < 0.3
+
+
 def test_two_ships_at_once_are_two_tracks():
     ships = [
         StraightCourse(T0 + 6000.0, 12_000.0, 60.0, 9.0),
