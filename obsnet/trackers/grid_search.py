@@ -54,7 +54,7 @@ COARSE_SHARE = 0.6
 POINTED = 4.0
 """What azimuth maps must say for a further ship that is heard by its range where azimuths are a louder one's, and located sharply."""
 
-SLOW = 2.0
+SLOW = 1.5
 """Times the least speed of a ship below which a track must outdo a source that swims."""
 
 SILENT = 3.0
@@ -330,9 +330,10 @@ class _Finder:
         fixed = (
             fixed_source(self.tiles, scores, lo, hi, config.still_deg_per_hour) if self.sees_course else 0.0
         )
+        swims = -np.inf
         if not silent and mean[3] < SLOW * config.min_speed_mps:
-            swims = SWIMS * config.min_speed_mps
-            fixed = max(fixed, swimming_source(best, self.tiles, self.delay, scores, lo, hi, swims))
+            fastest = SWIMS * config.min_speed_mps
+            swims = swimming_source(best, self.tiles, self.delay, scores, lo, hi, fastest)
         method = "grid search" if self.sees_course else "grid search, no azimuth maps: course not observed"
         if silent:
             method = f"grid search, no range {'heard' if self.sees_range else 'maps'}"
@@ -355,6 +356,7 @@ class _Finder:
             "other_scale": 1.0 if ghost is None else ghost,
             "steady": two_steady(scores.azimuth_score[lo : hi + 1]) if silent else -np.inf,
             "log_bayes_factor_fixed": config.exponent * (float(score[0]) - fixed),
+            "log_bayes_factor_swims": config.exponent * (float(score[0]) - swims),
         }
         start, end = float(self.origin + self.tiles[lo]), float(self.origin + self.tiles[hi])
         track = Track(start, end, self._course(mean), cov, log_bayes_factor, method, extra)

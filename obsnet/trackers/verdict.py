@@ -46,7 +46,7 @@ def believable(track: Track, config: GridSearchConfig) -> bool:
     long_enough = track.end - track.start >= brief * config.shortest_s - config.tile_s
     within_range = abs(track.motion.cpa_range_m) < 0.98 * config.max_cpa_range_m
     located = track.std[0] < LOOSEST[0] and track.std[1] < LOOSEST[1]
-    moves = moving >= config.min_log_bayes_factor
+    moves = min(moving, track.extra.get("log_bayes_factor_swims", np.inf)) >= config.min_log_bayes_factor
     moves &= track.extra.get("score", 0.0) > track.extra.get("steady", -np.inf)
     return bool(long_enough and within_speed and within_range and located and moves and is_one(track))
 
