@@ -93,8 +93,6 @@ class WaveformSource:
         By SEED id, for the channels that can serve.
     begin_ns, end_ns : int
         The span asked for, cut to what is there; ns since 1970.
-    bounded : bool
-        Whether the caller gave a start or an end.
     report : WaveformReport
     """
 
@@ -159,8 +157,8 @@ def open_waveforms(
 
     Parameters
     ----------
-    source : obspy Stream, path, or list of paths
-        Files in any format that obspy reads (pickles excepted), folders (searched to any depth), wildcards,
+    source : obspy Stream, path, list of paths, or WaveformSource
+        What was opened before keeps its span where no other is given. Files in any format that obspy reads (pickles excepted), folders (searched to any depth), wildcards,
         SDS archives.
     station : Station
         Whose channels to look for. Waveforms that differ from a channel in nothing but a location code, or
@@ -185,6 +183,8 @@ def open_waveforms(
             f"the start {_iso(begin)} is not before the end {_iso(end)}; swap or correct them"
         )
     if isinstance(source, WaveformSource):
+        begin = source.begin_ns if begin is None else begin
+        end = source.end_ns if end is None else end
         return WaveformSource(station, source.timelines, source.report, begin, end)
     report = WaveformReport()
     if isinstance(source, (obspy.Stream, obspy.Trace)):

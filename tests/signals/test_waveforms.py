@@ -46,6 +46,14 @@ def sds(root, data, start, code="BDH", rate=50.0, location="00"):
         day += 86400
 
 
+def test_what_was_opened_for_a_span_keeps_it_when_it_is_opened_again():
+    first = open_waveforms(trace(noise(60_000)), STATION, starttime=START + 200, endtime=START + 600)
+    again = open_waveforms(first, STATION)
+    assert (again.begin_ns, again.end_ns) == (first.begin_ns, first.end_ns)
+    later = open_waveforms(first, STATION, starttime=START + 300)
+    assert (later.begin_ns, later.end_ns) == ((START + 300).ns, first.end_ns)
+
+
 @pytest.mark.parametrize("form", ["MSEED", "SAC", "GSE2", "SLIST", "TSPAIR", "SH_ASC"])
 def test_any_format_that_obspy_reads(tmp_path, form):
     data = noise(3000)
