@@ -30,6 +30,8 @@ MODELS = Path(__file__).parents[1] / "obsnet" / "models"
 DAY_S = 86400.0
 HOURS = 6.0
 FIRST_DAY = 1.62e9 // DAY_S * DAY_S
+FIRST_OTHER = 1000
+"""Day of the first record that both models are measured on."""
 WITH_SHIPS = ("ordinary", "faint", "two_ships", "turning_ship", "whales_and_earthquakes", "directional_noise")
 """Kinds of record by turns: what a station hears in a season."""
 
@@ -39,7 +41,7 @@ def days(seed: int, first: int, count: int, quiet_every: int = 0) -> Iterator[ki
     station = kinds.compose("ordinary", seed, HOURS)
     for day in range(first, first + count):
         quiet = quiet_every and day % quiet_every == 0
-        kind = "no_ship" if quiet else WITH_SHIPS[day % len(WITH_SHIPS)]
+        kind = "no_ship" if quiet else WITH_SHIPS[day // (quiet_every or 1) % len(WITH_SHIPS)]
         made = kinds.compose(kind, 100_000 + 1000 * seed + day, HOURS)
         start = FIRST_DAY + DAY_S * day
         later = start - made.start
@@ -140,7 +142,7 @@ def main() -> None:
     work = given.folder
     span = archive(work / "archive", days(given.seed, 0, given.days))
     passages = prepare(work / "prepared", of_archive(work / "archive", span, absence_known=False))
-    span = archive(work / "others", days(given.seed, 10_000, given.others, quiet_every=2))
+    span = archive(work / "others", days(given.seed, FIRST_OTHER, given.others, quiet_every=2))
     others = watched_days(work / "watched", span, of_archive(work / "others", span, absence_known=True))
     adapted = {name: work / name / "weights.pt" for name in ("azimuth", "range")}
     if not adapted["azimuth"].exists():
