@@ -20,7 +20,7 @@ from obsnet.ais import read as read_ais
 from obsnet.config import to_dict
 from obsnet.detectors.azimuth_features import AzimuthFeatures, Cells, FeatureConfig
 from obsnet.errors import ConfigError, WaveformError
-from obsnet.layout import parse_utc, to_posix
+from obsnet.layout import iso, parse_utc, to_posix
 from obsnet.learn.dataset import PreparedSet, Record, packed_cells, packed_table
 from obsnet.learn.labels import labels
 from obsnet.learn.scenes import NEVER_TRAINED, SceneConfig, draw_scene, read_courses, split_of
@@ -288,6 +288,9 @@ def archive_record(name: str, split: str, span: tuple[float, float], data: Archi
         data.waveforms, station, starttime=lead, endtime=span[1] + 180.0,
         min_rate_hz=data.front_end.spectra.analysis_rate_hz,
     )  # fmt: skip
+    begin, end = (round(1e9 * time) for time in span)
+    if not any(first < end and last > begin for first, last in source.covered(0)):
+        raise WaveformError(f"{station.code} has no waveforms from {iso(span[0])} to {iso(span[1])}")
     arrays = front_end(source, station, data.front_end)
     place = (station.latitude, station.longitude)
     ais = read_ais(list(data.ais), near=place)

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import obspy
 import pandas as pd
 import pytest
 
@@ -121,6 +122,23 @@ def test_an_archive_is_prepared_like_the_twin_and_goes_on(tmp_path):
     assert before == {name: (made.folder / f"{name}.zarr").stat().st_mtime_ns for name in names}
     first = PreparedSet(tmp_path / "set").read(names[0])
     assert first.minute[0] == start and 85 <= len(first.cell_index) <= 100
+
+
+def test_a_stretch_between_two_files_without_waveforms_is_passed_over(tmp_path):
+    scenario = Scenario.random(5, 0.6, 1, START, recorder=Recorder(depth_m=3000.0), nuisances=False)
+    write_simulation(scenario, tmp_path / "archive")
+    (tmp_path / "files").mkdir()
+    stream = obspy.read(str(tmp_path / "archive" / "waveforms.mseed"))
+    for name, later in (("first", 0.0), ("second", 4 * 3600.0)):
+        for trace in stream:
+            trace.stats.starttime += later
+        stream.write(str(tmp_path / "files" / f"{name}.mseed"), "MSEED")
+    data = ArchiveData(
+        waveforms=str(tmp_path / "files"), stationxml=str(tmp_path / "archive" / "station.xml"),
+        ais=(str(tmp_path / "archive" / "ais.csv"),), start="2012-11-01T00:00:00Z", end="2012-11-01T05:00:00Z", hours=0.5,
+    )  # fmt: skip
+    names = prepare(tmp_path / "set", data).names()
+    assert names == [f"archive-2012-11-01T{time}00" for time in ("0000", "0030", "0400", "0430")]
 
 
 def test_an_archive_without_waveforms_says_why(tmp_path):
