@@ -24,7 +24,7 @@ from obsnet.learn.azimuth import AzimuthRows, AzimuthTaskConfig
 from obsnet.learn.calibration import apply, metrics, outputs
 from obsnet.learn.dataset import PreparedSet
 from obsnet.learn.prepare import ArchiveData, archive_record, fill, prepare
-from obsnet.learn.range_calibration import hear, looked_at, measure, scorer_of
+from obsnet.learn.range_calibration import looked_at, measure
 
 MODELS = Path(__file__).parents[1] / "obsnet" / "models"
 DAY_S = 86400.0
@@ -114,18 +114,7 @@ def azimuth_measured(weights: Path, prepared: PreparedSet) -> dict[str, float]:
 def range_measured(weights: Path, prepared: PreparedSet) -> dict[str, float]:
     """What the range's weights do on test records."""
     network, calibration, features, _ = range_training.restored(weights)
-    heard = [
-        hear(
-            scorer_of(network),
-            range_training.cepstrogram_of(record),
-            record.table(),
-            range_training.truth_of(record),
-            range_training.known_minutes(record, features.range_m[-1]),
-            features,
-            look=calibration,
-        )
-        for record in range_training.range_records([prepared], "test")
-    ]
+    heard = range_training.hear_records(network, [prepared], "test", features, calibration)
     return measure(looked_at(heard, calibration.least), calibration, features)
 
 

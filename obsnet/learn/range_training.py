@@ -24,7 +24,7 @@ from obsnet.layout import from_posix
 from obsnet.learn.dataset import JoinedSets, PreparedSet, Record
 from obsnet.learn.networks import parameters
 from obsnet.learn.prepare import provenance
-from obsnet.learn.range_calibration import calibrate, hear, looked_at, measure, scorer_of
+from obsnet.learn.range_calibration import Heard, calibrate, hear, looked_at, measure, scorer_of
 from obsnet.learn.range_examples import FIELDS, RangeExamplesConfig, log_prior, range_density, range_examples
 from obsnet.learn.range_network import RangeNetwork, RangeNetworkConfig, place_loss, range_loss
 from obsnet.learn.task import Batch, TrainerConfig, calibrated_anew, fit, load_weights, save_weights, seeded
@@ -272,19 +272,7 @@ def finish(
     ship_share: float = SHIP_SHARE,
 ) -> dict[str, float]:
     """Calibrate a trained network on the validation records, measure it there, and write its weights."""
-    scorer = scorer_of(network)
-    heard = [
-        hear(
-            scorer,
-            cepstrogram_of(record),
-            record.table(),
-            truth_of(record),
-            known_minutes(record, task.features.range_m[-1]),
-            task.features,
-            look=task.look,
-        )
-        for record in range_records(sets, "validation")
-    ]
+    heard = hear_records(network, sets, "validation", task.features, task.look)
     calibration = calibrate(heard, task.features, task.look)
     heard = looked_at(heard, calibration.least)
     found = found | {f"validation_{k}": v for k, v in measure(heard, calibration, task.features).items()}
@@ -305,6 +293,29 @@ def finish(
     for name, value in found.items():
         say(f"{name} {value:.4g}")
     return found
+
+
+def hear_records(
+    network: RangeNetwork,
+    sets: Sequence[PreparedSet],
+    split: str,
+    features: RangeFeaturesConfig,
+    look: RangeCalibration,
+) -> list[Heard]:
+    """What a network says of the records of a split, beside the truth (`obsnet.learn.range_calibration.hear`)."""
+    scorer = scorer_of(network)
+    return [
+        hear(
+            scorer,
+            cepstrogram_of(record),
+            record.table(),
+            truth_of(record),
+            known_minutes(record, features.range_m[-1]),
+            features,
+            look=look,
+        )
+        for record in range_records(sets, split)
+    ]
 
 
 def restored(path: str | Path) -> tuple[RangeNetwork, RangeCalibration, RangeFeaturesConfig, dict[str, Any]]:

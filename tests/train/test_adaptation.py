@@ -12,6 +12,8 @@ def test_the_station_stays_and_everything_else_changes():
     assert len({(record.recorder, record.sea) for record in made}) == 1
     assert [record.kind == "no_ship" for record in made] == [day % 4 == 0 for day in range(12)]
     assert np.all(np.diff([record.start for record in made]) == 86400.0)
+    every_other = {record.kind for record in adaptation.days(3, 0, 12, quiet_every=2)}
+    assert every_other == {"no_ship", *adaptation.WITH_SHIPS}
     ships = [vessel for record in made for vessel in record.vessels]
     assert len({ship.mmsi for ship in ships}) == len(ships)
     for record in made:
